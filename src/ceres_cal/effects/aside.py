@@ -1,9 +1,9 @@
-"""Groups of observations that may not belong, as a whole: effects whose sizes are large.
+"""Groups of observations that may be wrong as a whole: effects whose sizes are large.
 
-A curve in one frame, a feature over all frames of a static camera; a frame of a static camera, a placement. Each may
-lie aside by a few modes (an offset and a turn of a line, another pose or shape of a board); all of them may lie aside a
-little. What residuals say of all their offsets together is the evidence that competing explanations are weighed by
-(`robust/competing.py`).
+A group is a curve in one frame, a feature over all frames of a static camera, a frame of a static camera, or a
+placement. Each may be displaced in a few modes (an offset and a rotation of a line, another pose or shape of a board),
+and all of them may be displaced a little. What the residuals say of all their offsets together is the evidence by which
+explanations are compared (`robust/competing.py`).
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from ceres_cal.observations import Observations, Sights, View, column_of
 from ceres_cal.problem import Equations, Estimate
 from ceres_cal.scene.targets import Arc
 
-FEWEST_VIEWS = 4  # of which one may not belong
+FEWEST_VIEWS = 4  # views from which on one of them may be found wrong
 
 
 class ObservationGroups(Frozen, ABC):
-    """The groups of one kind, by number, each of which may lie aside. There are numbers of which nothing was observed.
+    """The groups of one kind, by number, each of which may be misplaced. Some numbers may have no observations.
 
     Attributes:
-        kind: of the effect. prior: of one that lies aside. most_views: that are compared with one another. remedy: what
-            to look at where one does not belong.
-        observations: all of them. of: (N + M,) number of the group of each, points by row and then curves by row; -1
-            for none. size: how many numbers there are. frames: (V,) how many go with each view.
+        kind: of the effect. prior: on the offset of a misplaced group. most_views: number of views compared with one
+            another. remedy: what to check if a group is wrong.
+        observations: all of them. of: (N + M,) number of each observation's group, points by row and then curves by
+            row; -1 for none. size: number of groups. frames: (V,) number of frames in the group of each view.
     """
 
     kind: ClassVar[str]
@@ -53,17 +53,17 @@ class ObservationGroups(Frozen, ABC):
     frames: Indices
 
     def count(self, rows: Mask) -> Indices:
-        """(size,) how many of these observations (N + M,) each has."""
+        """(size,) numbers of the given observations (N + M,) in each group."""
         return np.bincount(np.where(rows, self.of, -1) + 1, minlength=self.size + 1)[1:]
 
     def among(self, numbers: Indices | Sequence[int]) -> Mask:
-        """(N + M,) the observations of some of them."""
-        chosen = np.zeros(self.size + 1, dtype=bool)  # whose last is that of -1
+        """(N + M,) mask of the observations of some groups."""
+        chosen = np.zeros(self.size + 1, dtype=bool)  # the last entry stands for group -1
         chosen[np.asarray(numbers, dtype=np.int64)] = True
         return np.asarray(chosen[self.of])
 
     def columns(self, equations: Equations, chosen: Indices) -> EffectColumns:
-        """How each of the chosen may lie aside, in standard deviations of an equation, columns of order one."""
+        """Columns, of order one, of how the chosen groups may be displaced, in standard deviations of an equation."""
         place = np.full(self.size + 1, -1)
         place[chosen] = np.arange(len(chosen))
         group = place[self.of[equations.observation]]
@@ -75,7 +75,7 @@ class ObservationGroups(Frozen, ABC):
         return EffectColumns(every, np.asarray(group), tuple(map(str, chosen.tolist())), kind=self.kind)
 
     def name(self, number: int) -> str:
-        """What one of them is, as in "line 'HalfwayLine' in frame '0003'"."""
+        """The name of a group, as in "line 'HalfwayLine' in frame '0003'"."""
         row = int(np.argmax(self.of == number))
         at = int(column_of(self.observations, "view")[row])
         view, several = self.observations.views[at], len(self.observations.stations) > 1
@@ -84,17 +84,18 @@ class ObservationGroups(Frozen, ABC):
 
     @abstractmethod
     def modes(self, equations: Equations, group: Indices) -> Array:
-        """(E, K) the ways to lie aside, by group (E,), -1 for none."""
+        """(E, K) the modes of displacement, by group (E,), -1 for none."""
 
     @abstractmethod
     def called(self, view: View, row: int, frames: int, seen_by: str) -> str:
-        """The name of the group of an observation of a view, which so many frames go with."""
+        """The name of the group of an observation of a view; `frames` is the number of frames in the group."""
 
 
 class FeatureGroups(ObservationGroups):
     """Features, in a frame or in all frames of a static camera.
 
-    A line may lie aside along its image's normal and be turned, an arc also be bent, a point lie aside either way.
+    A line may be displaced along its normal in the image and rotated, an arc also bent, and a point displaced along
+    both axes.
     """
 
     kind = "feature aside"
@@ -122,7 +123,7 @@ class FeatureGroups(ObservationGroups):
 class ViewGroups(ObservationGroups):
     """Frames of a static camera, and placements.
 
-    One may be a view from elsewhere, or of a target that is longer, wider, askew or bowed.
+    One of them may be a view from elsewhere, or of a target that is longer, wider, sheared or bowed.
     """
 
     kind = "view aside"
@@ -138,7 +139,7 @@ class ViewGroups(ObservationGroups):
 
 
 def _feature_modes(equations: Equations, rows: Indices) -> Array:
-    """(N, 3) of a line, an arc or a point."""
+    """(N, 3) modes of a line, an arc or a point."""
     modes = np.zeros((len(rows), 3))
     if not equations.is_curve[rows[0]]:
         modes[:, :2] = equations.direction[rows]
@@ -151,9 +152,9 @@ def _feature_modes(equations: Equations, rows: Indices) -> Array:
 
 
 def _view_modes(equations: Equations) -> Array:
-    """(E, 11) of another pose, and of a target that is stretched, sheared or bowed.
+    """(E, 11) modes of another pose, and of a target that is stretched, sheared or bowed.
 
-    Not twisted or wavy: with five shapes to choose from a good board of a real set came into doubt.
+    A twist and waves are left out: with five shapes to choose from, a good board of a real set became doubtful.
     """
     rotations = equations.poses[equations.sight][:, :, :3]
     along = np.einsum("ei,eij->ej", equations.motion, rotations[:, :, :2])
@@ -164,8 +165,8 @@ def _view_modes(equations: Equations) -> Array:
 
 
 def groups_of(sights: Sights) -> Iterator[ObservationGroups]:
-    """Curves in single frames; where a static camera has several, curves and points over all of them; then frames and
-    placements, where there are enough.
+    """Curves in single frames; curves and points over all frames of a static camera; then frames and placements, if
+    there are enough of them.
     """
     observations = sights.observations
     views = np.arange(len(observations.views))
@@ -189,13 +190,13 @@ def groups_of(sights: Sights) -> Iterator[ObservationGroups]:
 
 
 def _features(observations: Observations, owner: Indices, frames: Indices) -> FeatureGroups:
-    """Of features by owner (V,) of their views, -1 for none; of single frames only curves."""
+    """Features by the owner (V,) of their views, -1 for none; in single frames only curves."""
     view, feature = (column_of(observations, name).astype(np.int64) for name in ("view", "feature"))
     is_curve = np.arange(len(view)) >= len(observations.points)
     takes_part = (owner[view] >= 0) & (is_curve | (frames[view] > 1))
     targets, names = len(observations.targets), int(feature.max(initial=0)) + 1
     target = numbers_of((one.target for one in observations.views), observations.targets)
-    number = ((owner[view] * 2 + is_curve) * targets + target[view]) * names + feature  # each target's begin with 0
+    number = ((owner[view] * 2 + is_curve) * targets + target[view]) * names + feature  # feature: from 0 per target
     return FeatureGroups(
         observations,
         np.where(takes_part, number, -1).astype(np.int32),
@@ -204,15 +205,16 @@ def _features(observations: Observations, owner: Indices, frames: Indices) -> Fe
     )
 
 
-# ---- what is said of all of them -----------------------------------------------------------------------------------
+# ---- offsets of all groups ------------------------------------------------------------------------------------------
 
 
 class Offsets(Frozen):
     """What residuals say of the offsets of G groups.
 
     Attributes:
-        effects: their modes as random effects. modes: (G, R, M) what an offset of each group does to them.
-        prior: of a group that does not belong, and of its offset.
+        effects: the modes of the groups as random effects. modes: (G, R, M) the effect of an offset of each group on
+            them.
+        prior: that a group is wrong, and the size of its offset.
     """
 
     effects: RandomEffects
@@ -220,19 +222,19 @@ class Offsets(Frozen):
     prior: SizePrior
 
     def log_evidence(self, wrong: Sequence[int] = ()) -> float:
-        """Of these groups not belonging, all others scattering alike."""
+        """Log evidence that these groups are wrong, and all others scatter alike."""
         return float(self._log_evidence(self._together(wrong)[None], len(wrong))[0])
 
     def log_evidence_with_each(self, wrong: Sequence[int] = ()) -> Array:
-        """(G,) the same with each one of the groups besides; -inf for those that are there already."""
+        """(G,) log evidence with each one of the groups wrong as well; -inf for those that already are."""
         known = np.broadcast_to(self._together(wrong), (len(self.modes), *self._together(wrong).shape))
         evidence = self._log_evidence(np.concatenate([known, self.modes], axis=2), len(wrong) + 1)
         evidence[list(wrong)] = -np.inf
         return evidence
 
     def odds(self, one: int, wrong: Sequence[int]) -> tuple[float, int | None]:
-        """Log odds that one of the wrong groups does not belong, against that it does, or another one in its place:
-        then which.
+        """Log odds that one of the wrong groups is wrong, against that none, or another group in its place, is wrong;
+        and the number of that other group, or None.
         """
         others = [other for other in wrong if other != one]
         each, none = self.log_evidence_with_each(others), self.log_evidence(others)
@@ -241,7 +243,7 @@ class Offsets(Frozen):
         return evidence - max(none, float(each[rival])), rival if each[rival] > none else None
 
     def next(self, wrong: Sequence[int]) -> int | None:
-        """The group that does not belong, either, when these do not; None where there is none."""
+        """The group that is also wrong, if these are; None where there is none."""
         each = self.log_evidence_with_each(wrong)
         best = int(np.argmax(each))
         return best if each[best] > self.log_evidence(wrong) else None
@@ -251,7 +253,9 @@ class Offsets(Frozen):
         return np.concatenate([np.zeros((self.modes.shape[1], 0)), *self.modes[list(groups)]], axis=1)
 
     def _log_evidence(self, modes: Array, count: int) -> Array:
-        """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
+        """(H,) log evidence of hypotheses with `count` wrong groups, whose modes (H, R, K) have offsets of
+        their own.
+        """
         sizes, scatter = self.prior.sizes[: None if count else 1], OFFSETS_SCATTER.scatter
         logs = self.effects.log_evidence(modes, scatter, np.array(sizes))
         priors = np.tile(OFFSETS_SCATTER.probabilities / len(sizes), len(sizes))
@@ -260,11 +264,11 @@ class Offsets(Frozen):
 
 
 def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) -> Offsets:
-    """What a model's residuals say of offsets.
+    """What a model's residuals say of the offsets of groups.
 
     Args:
-        effect: its columns, here in standard deviations of an equation, of order one. prior: of a group that does not
-            belong.
+        effect: its columns, here in standard deviations of an equation, of order one. prior: that a group is wrong, and
+            the size of its offset.
     """
     columns, group = effect.columns, effect.group
     groups, width = int(group.max()) + 1, columns.shape[1]
@@ -273,7 +277,7 @@ def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) 
     there = np.flatnonzero(every.summed(every.values))
     normal, slope, _ = every.left_of(model)
     normal, slope = normal[np.ix_(there, there)], slope[there]
-    least = 1e-5 * float(np.bincount(group[rows]).max())  # what the model leaves of directions that can be judged
+    least = 1e-5 * float(np.bincount(group[rows]).max())  # what the model must leave of a direction to be judged
     effects = RandomEffects.of(normal, slope, least)
     rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
     exact = model.spare * (LEAST_PX * median(model.weight[rows])) ** 2
@@ -283,16 +287,16 @@ def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) 
 
 
 DOUBTFUL = 3.0
-"""Log odds between which both explanations are named: 19 to 1."""
+"""Log odds below which both explanations are reported: 20 to 1, a probability of 95 %."""
 
 
 class Explanation(Frozen):
-    """That a group of observations does not belong.
+    """The explanation that a group of observations is wrong.
 
     Attributes:
-        name: of the group. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
-            lies aside, the median. log_odds: natural logarithm of the odds that it does not belong.
-        remedy: what to look at. other: the estimate of the less probable explanation.
+        name: of the group. rows: (N + M,) its observations, points by row and then curves by row. aside_px: median
+            distance from its nominal position. log_odds: natural logarithm of the odds that it is wrong.
+        remedy: what to check. other: the estimate under the less probable explanation.
     """
 
     name: str
@@ -309,22 +313,22 @@ class Explanation(Frozen):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether both explanations are to be named."""
+        """Whether both explanations are to be reported."""
         return abs(self.log_odds) < DOUBTFUL
 
     @property
     def is_taken(self) -> bool:
-        """Whether it is the more probable one, and its observations are taken out."""
+        """Whether it is the more probable explanation, so that its observations are left out."""
         return self.log_odds > 0.0
 
     @property
     def words(self) -> str:
-        """What it says."""
+        """The explanation in words."""
         return f"the whole of {self.name}: {np.count_nonzero(self.rows)} rows, {two_digits(self.aside_px)} px off"
 
     @property
     def warning(self) -> str:
-        """What to know before the calibration is used."""
+        """The warning for users of the calibration."""
         if not self.is_doubtful:
             return f"{self.words}: taken out together; {self.remedy}"
         where = f"{self.name} may be {two_digits(self.aside_px)} px off its nominal position"

@@ -1,14 +1,14 @@
-"""Columns of an effect over the equations, and what the residuals say of its amounts once the free numbers followed.
+"""Columns of an effect over the equations, and what the residuals say of its amounts after the free numbers followed.
 
-An effect has groups (each line, each frame, everything after a frame) with amounts of their own. What is said of each
-group by itself is enough for a score test (`EffectSums`); what is said of all groups together, for evidence
-(`SparseColumns`). Each amount moves few equations, so sums are taken by amount, and nothing is as large as equations
+An effect has groups (each line, each frame, everything after a frame), and each group has its own amounts. Sums for
+each group by itself suffice for a score test (`EffectSums`); sums for all groups together give the evidence
+(`SparseColumns`). Each amount moves few equations, so sums are taken by amount, and no array has the size equations
 times amounts.
 
-Score tests of many effects at once: with X the columns of one group of an effect beyond the free numbers and r the
-residuals, both in standard deviations, r'X (X'X)^-1 X'r over the mean square of what is left is Fisher's F where the
-noise is normal, and -(X'X)^-1 X'r is the amount that would mend it. Of those that the residuals speak for the strongest
-is chosen first, then what it leaves (forward selection).
+Score tests of many effects at once: let X be the columns of one group beyond the free numbers and r the residuals, both
+in standard deviations. Then r'X (X'X)^-1 X'r over the mean square of what is left is Fisher's F if the noise is normal,
+and -(X'X)^-1 X'r is the amount that would correct the fault. The strongest significant effect is chosen first, then the
+strongest of what it leaves (forward selection).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ceres_cal.problem import Equations, Estimate, unit_px
 
 
 class EffectColumns(Frozen):
-    """Columns of an effect over the equations, by group: each group has amounts of its own.
+    """Columns of an effect over the equations, by group: each group has its own amounts.
 
     Attributes:
         columns: (E, Q) px per unit of the Q amounts, for every equation.
-        group: (E,) which group's amounts move each equation, -1 for none.
-        subjects: what each group is about. frames: at which frame; empty where all are about all frames.
+        group: (E,) the group whose amounts move each equation, -1 for none.
+        subjects: what each group is about. frames: the frame of each group; empty where all are about all frames.
         onwards: whether the amounts of group g move the groups after g instead of group g itself.
-        kind: of the effect.
+        kind: the kind of the effect.
     """
 
     columns: Array
@@ -47,7 +47,7 @@ class EffectColumns(Frozen):
 
 
 def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
-    """The different values in the chosen rows, and which of them each row (N,) has, -1 for the others."""
+    """The distinct values in the chosen rows, and the number of the value of each row (N,), -1 for other rows."""
     numbers, inverse = np.unique(values[rows], return_inverse=True)
     group = np.full(len(values), -1)
     group[rows] = inverse
@@ -55,8 +55,8 @@ def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
 
 
 def least_absolute(columns: Array, residual: Array) -> Array:
-    """(Q,) amounts of columns (N, Q) that leave the least absolute deviations of residuals (N,), all in standard
-    deviations: by least squares again and again, each residual weighed by what was left of it.
+    """(Q,) amounts for which columns (N, Q) leave the least absolute deviations of residuals (N,), all in standard
+    deviations, by iteratively reweighted least squares.
     """
     amount = np.zeros(columns.shape[1])
     for _ in range(30):
@@ -66,13 +66,13 @@ def least_absolute(columns: Array, residual: Array) -> Array:
 
 
 class EffectSums(Frozen):
-    """What the equations say of each of an effect's G groups: X its columns beyond the free numbers of a model, and r
-    the residuals, both in standard deviations.
+    """Sums over the equations of each of an effect's G groups, with X its columns beyond the free numbers of a model
+    and r the residuals, both in standard deviations.
 
     Attributes:
-        rows: (N,) the equations in use that it moves, by group. columns: (N, Q) of the effect there.
-        sizes: (G, Q) squared lengths of the columns as they are. normals: (G, Q, Q) X'X. scores: (G, Q) X'r.
-        directions: how many shared directions of the model X is beyond.
+        rows: (N,) the used equations that it moves, by group. columns: (N, Q) of the effect in these rows.
+        sizes: (G, Q) squared lengths of the original columns. normals: (G, Q, Q) X'X. scores: (G, Q) X'r.
+        directions: number of shared directions of the model that are projected out of X.
     """
 
     effect: EffectColumns
@@ -85,7 +85,7 @@ class EffectSums(Frozen):
 
     @classmethod
     def of(cls, model: Linearised, effect: EffectColumns) -> EffectSums:
-        """Of an effect."""
+        """The sums of an effect beyond the free numbers of a model."""
         inside = np.flatnonzero((effect.group >= 0) & model.used)
         rows = inside[np.argsort(effect.group[inside], kind="stable")]
         blank = cls(effect, rows, effect.columns[rows] * model.weight[rows, None])
@@ -96,32 +96,32 @@ class EffectSums(Frozen):
         return whole.beside(model)
 
     def beside(self, model: Linearised) -> EffectSums:
-        """The same beyond all that is free in a model that has more of it."""
+        """The sums beyond everything that is free in a model with more shared directions."""
         new = slice(self.directions, None)
         taken = self._products(model.shared[:, new].take(self.rows, axis=0))
         normals, scores = taken @ taken.transpose(0, 2, 1), taken @ model.step[new]
         return replace(self, normals=self.normals - normals, scores=self.scores - scores, directions=len(model.step))
 
     def _products(self, values: Array) -> Array:
-        """(G, Q, K) of each group's columns with values (N, K) of the rows."""
+        """(G, Q, K) products of each group's columns with values (N, K) of the rows."""
         products = np.zeros((len(self.effect.subjects), self.columns.shape[1], values.shape[1]))
         for number, first, last in self._runs:
             np.matmul(self.columns[first:last].T, values[first:last], out=products[number])
-        if self.effect.onwards:  # group g stands for all groups after it
+        if self.effect.onwards:  # group g moves all groups after it
             products[:-1] = np.cumsum(products[:0:-1], axis=0)[::-1]
             products[-1] = 0.0
         return products
 
     @cached_property
     def _runs(self) -> list[tuple[int, int, int]]:
-        """Each group that has rows, where they begin and where they end."""
+        """Number, first row and end of each group that has rows."""
         group = self.effect.group[self.rows]
         starts = np.flatnonzero(np.diff(group, prepend=-1))
         ends = np.append(starts, len(group))[1:]
         return list(zip(group[starts].tolist(), starts.tolist(), ends.tolist(), strict=True))
 
     def _private_squares(self, model: Linearised) -> Array:
-        """(G, Q, Q) squares of what each group's columns have in the private bases."""
+        """(G, Q, Q) squares of the parts of each group's columns along the private bases."""
         size, count = self.columns.shape[1], len(self.effect.subjects)
         squares, held = np.zeros((count + 1, size, size)), np.flatnonzero(model.of_private[self.rows])
         if not len(held):
@@ -138,7 +138,7 @@ class EffectSums(Frozen):
         if not self.effect.onwards:
             np.add.at(squares, group, inside @ inside.transpose(0, 2, 1))
             return squares[:-1]
-        # From one group of a sight on, up to the next, the groups move all that come after.
+        # All groups from one that a sight shows up to its next one move the same equations: those that come after.
         first = np.flatnonzero(np.diff(sight, prepend=-1))
         after = np.vstack([np.cumsum(inside[::-1], axis=0)[::-1], np.zeros_like(inside[:1])])
         end = np.append(first, len(sight))[np.searchsorted(first, np.arange(len(sight)), side="right")]
@@ -149,14 +149,15 @@ class EffectSums(Frozen):
         return np.cumsum(squares, axis=0)[:-1]
 
 
-_MOST_ENTRIES = 4_000_000  # of a matrix: 32 MB
+_MOST_ENTRIES = 4_000_000  # entries of a matrix: 32 MB
 
 
 class SparseColumns(Frozen):
-    """Columns of Q numbers over E equations, in standard deviations.
+    """Columns of Q numbers over E equations, in standard deviations, stored by equation.
 
     Attributes:
-        slots: (E, B) which numbers move each equation, Q for none. values: (E, B) by how much, 0 where it is not used.
+        slots: (E, B) numbers that move each equation, Q for none. values: (E, B) by how much, 0 where it is not
+            used.
         size: Q.
     """
 
@@ -166,8 +167,8 @@ class SparseColumns(Frozen):
 
     @classmethod
     def of_groups(cls, model: Linearised, columns: Array, group: Indices, groups: int) -> SparseColumns:
-        """Of groups of equations (E,), -1 for none, which have a number for each of the columns (E, M), in standard
-        deviations; group after group.
+        """Those of groups of equations (E,), -1 for none, each with a number for each of the columns (E, M) in standard
+        deviations; numbers are ordered by group.
         """
         width, there = columns.shape[1], (group >= 0) & model.used
         slots = np.where(there[:, None], group[:, None] * width + np.arange(width), groups * width)
@@ -175,7 +176,7 @@ class SparseColumns(Frozen):
 
     @classmethod
     def side_by_side(cls, parts: Sequence[SparseColumns], equations: int) -> SparseColumns:
-        """Those of several effects, one after the other."""
+        """The columns of several effects, one effect after the other."""
         firsts = np.cumsum([0, *(part.size for part in parts)])
         size, nothing = int(firsts[-1]), np.zeros((equations, 0), dtype=np.int64)
         slots = [
@@ -184,31 +185,31 @@ class SparseColumns(Frozen):
         return cls(np.hstack([nothing, *slots]), np.hstack([nothing, *(part.values for part in parts)]), size)
 
     def gathered(self, factors: Array, owner: Indices, owners: int) -> Array:
-        """(owners, Q) sums of the values times factors (E,) or (E, B), by number and owner (E,)."""
+        """(owners, Q) sums of the values times factors (E,) or (E, B), by owner (E,) and number."""
         products = self.values * (factors if factors.ndim == 2 else factors[:, None])
         key = owner[:, None] * (self.size + 1) + self.slots
         sums = np.bincount(key.ravel(), products.ravel(), minlength=owners * (self.size + 1))
         return np.asarray(sums.reshape(owners, -1)[:, :-1])
 
     def summed(self, factors: Array) -> Array:
-        """(Q,) the same over all equations."""
+        """(Q,) sums of the values times factors over all equations."""
         return np.asarray(self.gathered(factors, np.zeros(len(self.slots), dtype=np.int64), 1)[0])
 
     @cached_property
     def _matrix(self) -> Array | None:
-        """(E, Q) the same as one matrix; None where sums one by one take less time, or less memory."""
+        """(E, Q) the columns as one dense matrix; None where separate sums take less time or memory."""
         few, (equations, width) = 2, self.slots.shape
         small = self._has_few and equations * self.size <= _MOST_ENTRIES
         return self._rows(slice(None)) if small or self.size <= few * width else None
 
     @property
     def _has_few(self) -> bool:
-        """Whether sums of many columns at once take less time as products of a matrix, its zeros and all."""
-        many = 40  # times as many numbers as move an equation
+        """Whether sums of many columns take less time as products of a dense matrix, zeros included."""
+        many = 40  # ratio of all numbers to those that move one equation
         return bool(self.size <= many * self.slots.shape[1])
 
     def _rows(self, rows: slice) -> Array:
-        """(E, Q) the same of some equations as a matrix."""
+        """(E, Q) some equations as a dense matrix."""
         slots, values = self.slots[rows], self.values[rows]
         at = np.arange(len(slots))[:, None] * (self.size + 1) + slots
         whole = np.bincount(at.ravel(), values.ravel(), minlength=len(slots) * (self.size + 1))
@@ -222,11 +223,11 @@ class SparseColumns(Frozen):
         return np.asarray(np.sum(every, axis=0)[:-1])
 
     def at(self, amounts: Array) -> Array:
-        """(E,) what amounts (Q,) do to the equations."""
+        """(E,) by how much amounts (Q,) move the equations."""
         return np.asarray(np.sum(self.values * np.append(amounts, 0.0)[self.slots], axis=1))
 
     def in_private(self, model: Linearised, part: Indices | None = None) -> Array:
-        """(6, S, Q) what the private placement of each sight takes of them, or of parts (E,) of sights."""
+        """(6, S, Q) their parts along the private basis of each sight, or of parts (E,) of sights."""
         part = model.equations.sight if part is None else part
         parts = int(part.max()) + 1
         if not model.of_private.any():
@@ -238,7 +239,7 @@ class SparseColumns(Frozen):
         return np.array([self.gathered(column, part, parts) for column in model.private.T])
 
     def in_shared(self, model: Linearised) -> Array:
-        """(P, Q) what the shared numbers take of them."""
+        """(P, Q) their parts along the shared directions."""
         if self._matrix is not None:
             return np.asarray(model.shared.T @ self._matrix)
         if self._has_few:
@@ -251,17 +252,18 @@ class SparseColumns(Frozen):
         return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
 
     def left_of(self, model: Linearised) -> tuple[Array, Array, Array]:
-        """V (Q, Q) and u (Q,), see `effects.evidence`, and what the shared numbers take (P, Q)."""
+        """V (Q, Q) and u (Q,), see `effects.evidence`, and the parts along the shared directions (P, Q)."""
         private, shared = np.concatenate(self.in_private(model)), self.in_shared(model)
         return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over), shared
 
 
 # ---- score tests ----------------------------------------------------------------------------------------------------
 
-# Nats of log p: alternatives nearer than that are told apart by luck. Of what is planted the right name is first by 20.
+# Difference of log p, in nats, below which only luck distinguishes alternatives. For planted faults the right name is
+# ahead by 20.
 _ALIKE = 7.0
-# Of the first cause's statistic: below it the error of its linear picture speaks. At half of it one of seven planted
-# faults has a second finding beside it, at double nothing changes.
+# Share of the first cause's statistic below which a test shows only the error of the first cause's linear model. At
+# half of it, one of seven planted faults has a second finding beside it; at double nothing changes.
 _LEAST_SHARE = 0.02
 
 
@@ -269,9 +271,9 @@ class ScoreTest(Frozen):
     """The score test of one group of an effect.
 
     Attributes:
-        effect, number: which. statistic: decrease of the squared residuals, in variances. rank: numbers it can tell.
-        log_p: natural logarithm of the probability of as much in mere noise, not corrected for how many were tested.
-        amount: (Q,) what would mend it. sd: (Q,) standard deviations, infinite for a number it cannot tell at all.
+        effect, number: the group. statistic: decrease of the squared residuals, in variances. rank: determined numbers.
+        log_p: natural logarithm of the probability of such a statistic in noise, not corrected for the number of tests.
+        amount: (Q,) the amounts that would correct it. sd: (Q,) their standard deviations, infinite if undetermined.
         rivals: alternatives of other kinds that explain nearly as much, and nothing more beside it.
     """
 
@@ -301,12 +303,12 @@ class ScoreTest(Frozen):
 def score_all(
     model: Linearised, alternatives: Sequence[EffectSums], inflation: float = 1.0, *, by_chance: bool = True
 ) -> list[ScoreTest]:
-    """The tests of every alternative that the free numbers leave testable.
+    """Test every alternative that the free numbers leave testable.
 
     Args:
-        alternatives: of each effect, beyond the free numbers of this model.
-        inflation: how many observations weigh as much as one independent one, where neighbours agree.
-        by_chance: whether log_p is asked, which takes as long as the rest; else it is 0.
+        alternatives: the sums of each effect beyond the free numbers of this model.
+        inflation: number of observations that count as one independent one, where neighbours' errors are correlated.
+        by_chance: whether log_p is computed, which takes as long as the rest; otherwise it is 0.
     """
     squares, equations = float(model.left_over @ model.left_over), model.spare + model.known_noise
     slope = _robust_slope(model)
@@ -344,15 +346,15 @@ def _robust_slope(model: Linearised) -> float:
     return float(plain @ model.score) / max(float(plain @ plain), 1e-300)
 
 
-# ---- the choice among them ------------------------------------------------------------------------------------------
+# ---- the selection --------------------------------------------------------------------------------------------------
 
 
 class Selection(Frozen):
-    """The alternatives chosen, and the model with all of them in.
+    """The alternatives chosen, and the model that includes all of them.
 
     Attributes:
-        chosen: in the order of their strength, with their amounts when all of them are free at once.
-        tests: number of alternatives that could be tested, and `extra`.
+        chosen: in the order of selection, with their amounts when all of them are free at once.
+        tests: number of alternatives that could be tested, plus `extra`.
         log_level: natural logarithm of the probability below which one is chosen.
         model: the model with the chosen ones free.
     """
@@ -370,13 +372,13 @@ class Selection(Frozen):
 def select(
     model: Linearised, alternatives: Sequence[EffectSums], rate: float, extra: int, inflation: float = 1.0
 ) -> Selection:
-    """Alternatives whose tests would give a false alarm with probability `rate` in all, one after the other, each with
-    those before it free.
+    """Select significant alternatives one after the other, each beside those before it. In noise, any is selected with
+    probability `rate`.
 
     Args:
-        alternatives: see `score_all`. extra: how many other tests share the rate. inflation: see `score_all`.
+        alternatives: see `score_all`. extra: number of other tests that share the rate. inflation: see `score_all`.
     """
-    most = 12  # causes that are named; more than that is not a calibration with faults but none
+    most = 12  # causes that are reported; with more, it is no calibration with faults but none at all
     chosen: list[ScoreTest] = []
     extended, scores = model, score_all(model, alternatives, inflation)
     tests = len(scores) + extra
@@ -400,7 +402,7 @@ def select(
 def _rivals(
     best: ScoreTest, before: Sequence[ScoreTest], after: Sequence[ScoreTest], log_level: float
 ) -> tuple[ScoreTest, ...]:
-    """Alternatives of other kinds that were about as probable as the best one, and are nothing beside it."""
+    """Alternatives of other kinds that were about as probable as the best one, and are not significant beside it."""
     left = {(id(score.effect), score.number): score.log_p for score in after}
     near = [
         score
@@ -417,7 +419,7 @@ def smooth_image(equations: Equations, estimate: Estimate) -> Array:
     radius.
     """
     every = []
-    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
+    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of the polynomials; of r^2 in displacements along the radius
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
     for name in equations.sights.cameras:
         camera = estimate.cameras[name]
@@ -432,7 +434,7 @@ def smooth_image(equations: Equations, estimate: Estimate) -> Array:
 
 
 def places_in_view(equations: Equations) -> Array:
-    """(E, 2) x and y from -1 to 1 over what is seen of each sight."""
+    """(E, 2) x and y of the pixels, scaled to -1 ... 1 over the observed part of each sight."""
     starts = equations.bounds[:-1]
     low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
     half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
@@ -440,8 +442,8 @@ def places_in_view(equations: Equations) -> Array:
 
 
 def smooth_view(equations: Equations, place: Array) -> Array:
-    """(E, 2, 5) smooth displacements of each sight along both axes of the image: polynomials of these places (E, 2) but
-    for the constant, which is the pose's.
+    """(E, 2, 5) smooth displacements of each sight along both axes of the image: polynomials of places (E, 2) without
+    the constant, which the pose absorbs.
     """
     (x, y), third = place.T, 1.0 / 3.0  # the mean of x^2
     each = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])

@@ -1,17 +1,16 @@
-"""What the residuals say of the errors' dependence, as one covariance of everything shared (a sandwich).
+"""Estimate the dependence of errors from the residuals, as one covariance of all shared numbers (a sandwich).
 
-First what goes together within a view, and what displaces its rows as they are read out one after the other (a rolling
-shutter), then whether views scatter as that says (`effects/groups.py`). In
-directions in which the model knows everything shared to one (root root^T its covariance) the observations, of
-information A, have a score of covariance C = M - P with P the priors: with S = root^T A and B = S root they say
-A + S^T (C^-1 - B^-1) S instead of A. Priors are as certain as they were; what nothing tells stays unknown.
+First what is correlated within a view, and what displaces its rows as they are read out one after the other (a rolling
+shutter); then whether views scatter as that predicts (`effects/groups.py`). In directions in which the model's
+information on everything shared is the unit matrix (root root^T its covariance), the observations, of information A,
+have a score of covariance C = M - P, with P that of the priors: with S = root^T A and B = S root they say A + S^T (C^-1
+- B^-1) S instead of A. Priors stay as certain as they were, and what nothing determines stays unknown.
 
-Errors that go together along a curve, or over a board, within one view or over all views of a sight.
-
-Their covariance falls off with the distance d on the target like exp(-d / l), and over boards, which bend smoothly,
-also like exp(-(d / l)^2 / 2). The likelihood of a grid of lengths l and shares (`effects/likelihood.py`) weighs them
-against independent errors, and the covariance of the scores is averaged over all (the best alone would be too sure of
-itself). Whether there is anything to look for is asked first, by score tests.
+Errors may be correlated along a curve, or over a board, within one view or over all views of a sight. Their covariance
+falls with the distance d on the target like exp(-d / l), and over boards, which bend smoothly, also like exp(-(d / l)^2
+/ 2). The likelihood on a grid of lengths l and shares (`effects/likelihood.py`) weighs them against independent errors.
+The covariance of the scores is averaged over all of these, since the best alone would be too certain. Score tests first
+show whether there is any correlation.
 """
 
 from __future__ import annotations
@@ -45,16 +44,17 @@ from ceres_cal.problem import Estimate, Information, Problem, ReducedInformation
 if TYPE_CHECKING:
     from ceres_cal.effects.likelihood import Likelihoods
 
-_INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
+_INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that count as infinite; steps of a bisection
 
 
 class Correlation(Frozen, eq=True):
-    """How the errors of one kind of observation go together.
+    """The correlation of errors of one kind of observation.
 
     Attributes:
-        kind: "points" or "curves". probability: that they do. length_m, share: the likeliest length over which, None
-            where whole curves lie aside, and share of the variance that does. lasting: whether over all views of a
-            sight, not anew in each of them. camera: whose they are; None where there is one.
+        kind: "points" or "curves". probability: that errors are correlated. length_m: the likeliest correlation length;
+            None where whole curves are displaced. share: of the variance that is correlated. lasting: whether errors
+            are the same in all views of a sight, not different in each. camera: the camera's name; None if there is
+            only one.
     """
 
     kind: str
@@ -66,11 +66,12 @@ class Correlation(Frozen, eq=True):
 
 
 def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[Array, Dependence]:
-    """(G, P, P) covariance of each group's score, with what a camera's errors have in common, and what that rests on.
+    """(G, P, P) covariance of each group's score, including correlations of a camera's errors, and the dependence
+    found.
 
     Args:
-        model: of some views, in directions in which everything is known to one. group: (E,) of the G views or
-            placements that are compared. informations: (G, P, P) of each, were errors independent.
+        model: of some views, in directions in which the information of everything is the unit matrix. group: (E,) the G
+            views or placements that are compared. informations: (G, P, P) of each group if errors were independent.
     """
     fewest_rows = 12
     scores, private, kinds, equations = informations.copy(), [1.0], [], model.equations
@@ -94,11 +95,11 @@ def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[
 
 
 class _Average(Frozen):
-    """The mean over the grid.
+    """The mean over the grid of correlations.
 
     Attributes:
-        families: of strands. at: the places, the first one independence. variance: (N,) in that of independence.
-        weight: (N,). inverse_freedom: of what is averaged.
+        families: of strands. at: places on the grid; the first is independence. variance: (N,) relative to that of
+            independence. weight: (N,) posterior probabilities. inverse_freedom: 1 / degrees of freedom of the average.
     """
 
     families: Sequence[StrandFamily]
@@ -109,7 +110,9 @@ class _Average(Frozen):
 
     @classmethod
     def of(cls, shared: Array, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
-        """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
+        """The average, weighted by likelihood and prior. Bent boards and lenses err smoothly; edges along a line do
+        not.
+        """
         negligible = 1e-3  # weight below which a place on the grid is left out
         from ceres_cal.effects.likelihood import likelihoods
 
@@ -120,12 +123,12 @@ class _Average(Frozen):
         weight /= weight.sum()
         weight[weight < negligible] = 0.0
         weight /= weight.sum()
-        used, rest = weight > 0.0, shared.shape[1] - own  # what all other rows say
+        used, rest = weight > 0.0, shared.shape[1] - own  # the information of all other rows
         mixed = 1.0 / _freedom_of_mixture(weight[used], (rest + variance * at.trace)[used])
         return cls(families, at, variance, weight, mixed + float(weight @ at.inverse_freedom))
 
     def correlation(self, kind: str, camera: str | None) -> Correlation:
-        """What is likeliest."""
+        """The likeliest correlation."""
         best = 1 + int(np.argmax(self.weight[1:])) if len(self.weight) > 1 else 0
         length, longest = float(self.at.length_m[best]), max(family.longest for family in self.families)
         aside, probability = length > 2.0 * longest, float(1.0 - self.weight[0])
@@ -133,10 +136,10 @@ class _Average(Frozen):
         return Correlation(kind, probability, None if aside else length, share, lasting, camera)
 
     def change(self, columns: Array, group: Indices) -> tuple[Array, float]:
-        """(G, P, P) what is added to the covariance of each group's score, and the factor on private placements.
+        """(G, P, P) the amount added to the covariance of each group's score, and the factor on private placements.
 
         Args:
-            columns: (E, 6 + P + 1) of the linear model.
+            columns: (E, 6 + P + 1) those of the linear model.
         """
         size = columns.shape[1] - 7
         scores, private = np.zeros((int(group.max()) + 1, size, size)), np.zeros(2)
@@ -151,14 +154,14 @@ class _Average(Frozen):
                 np.add.at(scores, group[[strand.rows[0] for strand in strands]], product[:, 6:, 6:])
                 if number == 0:
                     private[1] += float(np.sum(x[..., :6] ** 2))
-                # What moves all of a view is not its scatter.
+                # An error common to all rows of a view is not its scatter.
                 common = float(kernel.min()) * float(np.sum(x[..., :6].sum(axis=1) ** 2))
                 private[0] += float(np.trace(product[:, :6, :6], axis1=1, axis2=2).sum()) - common
         return scores, float(1.0 + max(private[0], 0.0) / private[1]) if private[1] > 0.0 else 1.0
 
     def _kernel(self, strand: Strand, here: Mask, weights: Array) -> Array:
-        """(N, N) sum of weights times the correlation at some places."""
-        rows = 64  # at a time, so that distances stay in the cache
+        """(N, N) sum of weights times correlations at some places of the grid."""
+        rows = 64  # rows at a time, so that distances stay in the cache
         places, used, together = strand.places, weights > 0.0, dict[tuple[float, bool], float]()
         for *place, weight in zip(self.at.length_m[here][used], self.at.smooth[here][used], weights[used], strict=True):
             together[*place] = together.get((*place,), 0.0) + weight
@@ -170,7 +173,7 @@ class _Average(Frozen):
             part = kernel[first : first + rows, first:]
             for weight, correlation in zip(each, decays(distance, along), strict=True):
                 part += weight * correlation
-            kernel[first:, first : first + rows] = part.T  # as far from the one to the other as back
+            kernel[first:, first : first + rows] = part.T  # the kernel is symmetric
         return kernel
 
 
@@ -178,8 +181,8 @@ class _Average(Frozen):
 
 
 def _freedom_of_mixture(weights: Array, variances: Array) -> float:
-    """Degrees of freedom at which Student's t is as wide at 95 % as a mixture of normals of these variances, once both
-    have the same mean variance.
+    """Degrees of freedom for which Student's t has the 95 % interval of a mixture of normals of these variances, if
+    both have the same mean variance.
     """
     mean = float(weights @ variances)
 
@@ -192,29 +195,30 @@ def _freedom_of_mixture(weights: Array, variances: Array) -> float:
 
 
 def _root_of(rising: Callable[[float], float], low: float, high: float) -> float:
-    """Where a rising function changes its sign, by bisection; one of the ends where it does not."""
+    """The place where a rising function changes its sign, by bisection; an end of the range where it does not."""
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)
     return 0.5 * (low + high)
 
 
-# Share of the largest variance of a score: what is below is rounding. Of a direction that priors alone know it was
-# 3e-10, and rounding of that made a standard deviation four times too large. Nothing changes up to a thousandfold.
+# Share of the largest variance of a score below which it is rounding. For a direction that only priors know it was
+# 3e-10, and its rounding made a standard deviation four times too large. Up to a thousandfold nothing changes.
 _DETERMINED = 1e-9
 _OVER = {"points": "errors are correlated between a target's points", "curves": "errors are correlated along lines"}
 
 
 class Dependence(Frozen, eq=True):
-    """What the residuals say of the errors' dependence.
+    """The dependence of errors, as the residuals show it.
 
     Attributes:
-        correlations: of points and of curves, where neighbours might agree. between: how views or placements scatter;
-            None where there are too few, or one sees what lasts over all of them.
-        private: factor on the variance of placements by their own observations.
-        inverse_freedom: 1 / degrees of freedom of all that, beside the noise scale's; of cameras the most.
-        read_out_px: standard deviation of what displaces the uppermost row of a view that is seen, and the lowest the
-            other way, as they are not read out at once; 0 where that is not likely.
+        correlations: of points and of curves whose neighbours might agree. between: the scatter of views or placements;
+            None where there are too few, or where an error that lasts over all of them would enter it.
+        private: factor on the variance of placements due to their own observations.
+        inverse_freedom: 1 / degrees of freedom of the dependence, without those of the noise scale; the largest of all
+            cameras.
+        read_out_px: standard deviation of the displacement of the uppermost observed row of a view, and of the lowest
+            in the opposite direction, because rows are read out one after the other; 0 where that is not likely.
     """
 
     correlations: tuple[Correlation, ...] = ()
@@ -225,12 +229,12 @@ class Dependence(Frozen, eq=True):
 
     @property
     def is_likely(self) -> bool:
-        """Whether anything goes together, or views scatter by more, or by less, than what is within them says."""
+        """Whether errors are likely correlated, or views scatter by another amount than errors within them predict."""
         return bool(self.causes) or (self.between is not None and self.between.probability > LIKELY)
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """What of it is likely and widens, in words."""
+        """The likely causes that widen, in words."""
         likely = [one for one in self.correlations if one.probability > LIKELY]
         causes = [_OVER[one.kind] + _reach(one) for one in likely]
         if self.read_out_px > 0.0:
@@ -245,18 +249,18 @@ def _reach(correlation: Correlation) -> str:
     length = correlation.length_m
     if length is None:
         over = " as a whole"
-    else:  # what repeats at each place alone has no length: the likeliest one was 13 nm
+    else:  # an error that repeats at each place alone has no length: the likeliest one was 13 nm
         over = f" over {two_digits(length)} m" if length >= 1e-3 else " over less than 1 mm"
     over += "" if correlation.camera is None else f" in camera {correlation.camera!r}"
     return over + (" in all views alike" if correlation.lasting else "")
 
 
 class Scatter(Frozen):
-    """How much more, or less, the shared numbers scatter than the model says.
+    """The scatter of the shared numbers, relative to what the model says.
 
     Attributes:
-        root: (K, P) from directions in which they are known to one by the model. matrix: (P, P) their covariance as
-            the data scatter. dependence: what that rests on.
+        root: (K, P) maps directions in which their information by the model is the unit matrix to the shared numbers.
+            matrix: (P, P) their covariance by the scatter of the data. dependence: what that is based on.
     """
 
     root: Array
@@ -264,10 +268,10 @@ class Scatter(Frozen):
     dependence: Dependence
 
     def widened(self, seen: Information) -> Information:
-        """What the observations say without any prior, as they scatter.
+        """The information of the observations without any prior, as they scatter.
 
         Args:
-            seen: what they say by the model.
+            seen: their information by the model.
         """
         along = self.root.T @ seen.matrix
         own = along @ self.root
@@ -275,9 +279,9 @@ class Scatter(Frozen):
         determined = values > _DETERMINED * values[-1]
         white = vectors[:, determined] / np.sqrt(values[determined])
         scores = np.eye(white.shape[1]) + white.T @ (self.matrix - np.eye(len(own))) @ white
-        # Of the variance by the model: errors that go together cancel in some directions, but nothing is known a
-        # hundred times better for that. In a rig whose cameras contradict one another it was 1e-8, and its rounding
-        # hid all else.
+        # Share of the model's variance that remains at least. Correlated errors cancel in some directions, but nothing
+        # is known a hundred times better because of that. In a rig whose cameras contradicted one another it was 1e-8,
+        # and its rounding hid everything else.
         least = 1e-4
         scatters, turned = np.linalg.eigh(0.5 * (scores + scores.T))
         inverse = (turned / np.maximum(scatters, least)) @ turned.T
@@ -286,10 +290,10 @@ class Scatter(Frozen):
 
 
 def scattered(reduced: ReducedInformation, scatter: Scatter | None) -> Information:
-    """What observations and priors say of everything shared, as the observations scatter.
+    """The information of observations and priors on everything shared, as the observations scatter.
 
-    What targets may be off is a scatter of theirs: trusted more than that where errors go together, it made halves of
-    real boards differ by 1.7 times what was stated.
+    The prior on targets as built describes a scatter of their own. If it were trusted more than the correlated
+    observations, halves of real boards would differ by 1.7 times what was stated.
     """
     if scatter is None:
         return reduced.shared
@@ -300,14 +304,15 @@ def scattered(reduced: ReducedInformation, scatter: Scatter | None) -> Informati
 def measure_scatter(
     problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
 ) -> Scatter | None:
-    """How the shared numbers scatter by the residuals; None where there is no such number, or nothing left over.
+    """Estimate the scatter of the shared numbers from the residuals; None where there are none, or nothing is left
+    over.
 
     Args:
-        problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
-            problem says there.
+        problem: as it was solved, at the estimated noise. there: residuals at the estimate. reduced: its information
+            there.
     """
-    # Views of a camera that are asked whether anything goes together, and where it likely does, how: by other 16 of 60
-    # or 120 views of a crooked lens the 95 % intervals were by up to a quarter shorter or longer, and held 65 to 100 %.
+    # Views of a camera for the first test, and for the estimate where dependence is likely: with another 16 of 60 or
+    # 120 views of a crooked lens, the 95 % intervals were up to a quarter shorter or longer, and held 65 to 100 %.
     few, many = 16, 64
     scatter = None
     for most_views in (few, many):
@@ -321,7 +326,7 @@ def measure_scatter(
 
 
 def _measured(problem: Problem, model: Linearised, reduced: ReducedInformation, estimate: Estimate) -> Scatter:
-    """By the equations of some views."""
+    """The scatter from the equations of some views."""
     group = views_or_placements(model.equations)
     prior = model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root
     groups = GroupNormals.of(model, group, prior)
@@ -343,13 +348,14 @@ def _measured(problem: Problem, model: Linearised, reduced: ReducedInformation, 
 
 
 class _ReadOut(Frozen):
-    """What moves while the rows of a view are read out one after the other: by so much its lowest row is displaced.
+    """Motion while the rows of a view are read out one after the other, as the displacement of its lowest row.
 
-    A pose follows nearly all of a shear or stretch, so that what is left of it tells little: beside the shared numbers,
-    which take it up, it displaces all. What more turns and zooms is among the smooth errors of a view.
+    A pose absorbs nearly all of a shear or stretch, so little of it is left to be seen; but the shared numbers, which
+    absorb it as well, are displaced by all of it. What turns and zooms is among the smooth errors of a view.
 
     Attributes:
-        sigma_px, probability: of either direction. scores: (S, P, P) what it adds to the covariance of each sight's.
+        sigma_px, probability: of either direction. scores: (S, P, P) what it adds to the covariance of each sight's
+            score.
     """
 
     sigma_px: float
@@ -358,10 +364,10 @@ class _ReadOut(Frozen):
 
     @classmethod
     def of(cls, model: Linearised, estimate: Estimate) -> _ReadOut | None:
-        """Of views of boards that one camera alone sees, for what contradicts another one may be of another moment;
-        None where they are few, or do not seem to be displaced.
+        """From views of boards that only one camera sees, since a contradiction with another may be due to another
+        moment; None where there are few, or where they do not seem to be displaced.
         """
-        fewest, enough = 5, 20  # views that tell anything, and that are asked how large it is
+        fewest, enough = 5, 20  # views: the least that are tested, and those from which the size is estimated
         equations = model.equations
         boards = np.flatnonzero(np.maximum.reduceat(model.of_private, equations.bounds[:-1]))
         if len(boards) < fewest:
@@ -382,19 +388,19 @@ class _ReadOut(Frozen):
         return cls(sigma, probability, probability * sigma**2 * there * (np.swapaxes(common, 1, 2) @ common))
 
     def beside(self, dependence: Dependence) -> Dependence:
-        """With what errors have in common besides."""
+        """The dependence with the read-out added."""
         inverse = dependence.inverse_freedom + self.probability / (2.0 * len(self.scores))
         likely_px = self.sigma_px if self.probability > LIKELY else 0.0
         return replace(dependence, inverse_freedom=inverse, read_out_px=likely_px)
 
 
 def _sizes_of_views(model: Linearised, estimate: Estimate, place: Array, views: Indices) -> tuple[float, float]:
-    """Sigma and probability of the read-out of some sights, beside smooth displacements of each, and of all alike.
+    """Sigma and probability of the read-out in some sights, beside smooth displacements of each and of all alike.
 
     Args:
         place: see `places_in_view`.
     """
-    tells = 1e-4  # share of the largest: of directions that tell anything beside the poses
+    tells = 1e-4  # share of the largest eigenvalue above which a direction counts beside the poses
     equations, count = model.equations, len(views)
     number = np.full(len(equations.bounds) - 1, -1)
     number[views] = np.arange(count)
@@ -414,8 +420,8 @@ def _sizes_of_views(model: Linearised, estimate: Estimate, place: Array, views: 
 
 
 def _stated_together(model: Linearised, group: Indices, scales: tuple[float, float]) -> Array:
-    """(G, P, P) what is added to the covariance of each group's score for what clearly scatters less than was stated of
-    each observation: as likely as not, the rest is what neighbours err by alike, which no residual shows.
+    """(G, P, P) the amount added to the covariance of each group's score where observations scatter clearly less than
+    their stated sigmas: as likely as not, the rest is an error that neighbours share, which no residual shows.
     """
     likely, by_chance, alike = 0.5, 1.0, 1e-3  # by_chance: standard errors of a scale. alike: sigmas, stated for all
     scores = np.zeros((int(group.max()) + 1, *2 * (model.columns.shape[1] - 7,)))
@@ -429,7 +435,7 @@ def _stated_together(model: Linearised, group: Indices, scales: tuple[float, flo
 
 
 def _whole(groups: GroupNormals, scores: Array) -> Array:
-    """(P, P) covariance of the score of everything: the views that were not looked at scatter like those that were."""
+    """(P, P) covariance of the score of everything, if the views left out of the sample scatter like those in it."""
     seen, everything = groups.normal.sum(axis=0), np.eye(len(groups.known)) - groups.known
     values, vectors = np.linalg.eigh(seen)
     determined = values > 1e-6

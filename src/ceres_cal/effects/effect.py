@@ -1,6 +1,8 @@
-"""What an effect is: something that may displace the observations, its columns over the equations and its words.
+"""The type of an effect: something that may displace the observations, with its columns over the equations and its
+words.
 
-What is found of it: the cause by name, how large, how sure; and what is solved for, targets as built and other effects.
+Also the types of what is found: a finding with its cause, size and certainty; and what is solved for, targets as built
+and other effects.
 """
 
 from __future__ import annotations
@@ -21,12 +23,12 @@ from ceres_cal.problem.residuals import Equations, plane_shift, whole_structure
 from ceres_cal.scene.camera import Camera
 
 SMALL = 0.4
-"""Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
+"""Ratio of an effect to the noise below which it shows only in many observations together, not in a single one."""
 Wrong = Literal["model", "calibration", "observations"]
 
 
 class Amount(Frozen, eq=True):
-    """One number that would mend it: its name, value, standard deviation and unit ("mm", "deg", "px", "")."""
+    """One number that would correct an effect: name, value, standard deviation and unit ("mm", "deg", "px", "")."""
 
     name: str
     value: float
@@ -35,18 +37,18 @@ class Amount(Frozen, eq=True):
 
 
 def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
-    """Several numbers of one unit."""
+    """Several amounts of one unit."""
     return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
 
 
 class AsBuilt(Frozen, eq=True):
-    """By how much the features of one kind lie off a target's drawing.
+    """How far the features of one kind are off a target's drawing.
 
     Attributes:
-        target, kind: "lines", "points", "warp", "heights" or "stretch". sigma_m: the standard deviation that their
-            offsets were solved for under. probability: that they are off at all. rms_m: of the offsets.
-        stretch: of a board that is stretched, by what share it is longer along x than along y, and the standard
-            deviation that its size then has; None of all else.
+        target: its name. kind: "lines", "points", "warp", "heights" or "stretch". sigma_m: the standard deviation of
+            the offsets under which they were solved for. probability: that they are off at all. rms_m: of the offsets.
+        stretch: for a stretched board, by what share it is longer along x than along y, and the standard deviation that
+            its size then has; None for all other kinds.
     """
 
     target: str
@@ -58,7 +60,7 @@ class AsBuilt(Frozen, eq=True):
 
     @property
     def words(self) -> str:
-        """What it says, without the target."""
+        """The words for it, without the target."""
         if self.stretch is not None:
             longer, sd = self.stretch
             sides = "x than along y" if longer > 0.0 else "y than along x"
@@ -70,12 +72,13 @@ class AsBuilt(Frozen, eq=True):
 
 
 class EffectEstimate(Frozen, eq=True):
-    """A group of an effect that was solved for, or of a floor that is taken into the standard deviations.
+    """A group of an effect that was solved for, or a floor's effect that only widens the standard deviations.
 
     Attributes:
-        kind, subject, frame: which, as a `Finding` has them. sigma: the standard deviation of its amounts, in their
-            own unit, that they were solved for under. probability: that there is such an effect.
-        sentence: what it is, in words. amounts: what was taken off the observations; both empty of what only widens.
+        kind, subject, frame: as in a `Finding`. sigma: the standard deviation of its amounts, in their own unit, under
+            which they were solved for. probability: that there is such an effect.
+        sentence: the effect in words. amounts: what was subtracted from the observations; both are empty if it only
+            widens.
     """
 
     kind: str
@@ -88,36 +91,38 @@ class EffectEstimate(Frozen, eq=True):
 
     @property
     def is_solved(self) -> bool:
-        """Whether its amounts were solved for; else what it may be is in the standard deviations alone."""
+        """Whether its amounts were solved for; if not, it only widens the standard deviations."""
         return bool(self.amounts)
 
     @property
     def warning(self) -> str:
-        """What somebody must know who uses the calibration."""
+        """The warning for users of the calibration."""
         return f"{self.sentence}; it was solved for"
 
 
 ShiftsAt = Callable[[Estimate, Problem | None], tuple[Sequence[Key], Sequence[Array]]]
-"""By how much effects let numbers scatter at an estimate, with what another problem states and holds: the numbers, and
-shifts of them whose products with themselves, added up, go into their covariance."""
+"""A function of an estimate and, if given, of another problem with its statements and held numbers. It returns keys,
+and shifts of these numbers: the sum of their outer products is what effects add to the covariance.
+"""
 
 
 class Finding(Frozen, eq=True):
-    """One cause of what is left over.
+    """One cause of residuals that the calibration does not explain.
 
     Attributes:
-        kind: of the effect or check. wrong: what is, the model (no covariance of the parameters contains that), the
-            calibration (a refit would mend it), or the observations, their labels or their noise.
-        subject: what it is about: a camera, a station, "target/feature", a board's target, "points" or "curves".
-            frame: at which frame, None where it is about all.
+        kind: of the effect or check. wrong: what is wrong: the model (no covariance of the parameters includes that),
+            the calibration (a refit would correct it), or the observations, their labels or their noise.
+        subject: a camera, a station, "target/feature", a board's target, "points" or "curves". frame: the name of the
+            frame; None for a finding about all frames.
         sentence: the cause in words. advice: what to do.
-        effect_px: root mean square displacement in the image of the observations that it moves (of the lens: of what
-            the calibration could not absorb); of noise its standard deviation, of a wrong label how far off it is.
-        noise_ratio: that over the noise of the same observations; below SMALL it shows in many of them together only.
-        effect_mm: the same on the target's plane; NaN where the plane is seen edge-on.
-        amounts: what would mend it.
+        effect_px: root mean square displacement in the image of the observations concerned (for the lens: of what the
+            calibration could not absorb); for noise its standard deviation, for a wrong label its distance.
+        noise_ratio: effect_px over the noise of the same observations; below SMALL it shows only in many observations
+            together.
+        effect_mm: the displacement on the target's plane; NaN where the plane is seen edge-on.
+        amounts: what would correct it.
         log10_p: decimal logarithm of the probability of a false alarm anywhere in the calibration, after Bonferroni.
-        observations: how many it moves; rows: (kind, row) of the observations of a wrong label.
+        observations: the number of observations concerned. rows: (kind, row) of the observations of a wrong label.
     """
 
     kind: str
@@ -136,15 +141,15 @@ class Finding(Frozen, eq=True):
 
     @property
     def is_model_error(self) -> bool:
-        """Whether it says that the model is wrong, so that no covariance contains it."""
+        """Whether the model is wrong, so that no covariance includes the error."""
         return self.wrong == "model"
 
 
 class Case(Frozen):
-    """What effects are looked for in: a problem where its solve ended.
+    """The problem in which effects are looked for, where its solve ended.
 
     Attributes:
-        problem: of all the observations. model: its equations there, before any effect is put in.
+        problem: of all the observations. model: its equations at the estimate, before any effect is added.
     """
 
     problem: Problem
@@ -167,17 +172,17 @@ class Case(Frozen):
 
     @cached_property
     def whole_structure(self) -> Structure:
-        """Everything that could be built otherwise than it is drawn."""
+        """The structure with everything that could differ from its drawing."""
         return whole_structure(self.problem.observations.targets)
 
     @cached_property
     def slots(self) -> tuple[Indices, Indices]:
-        """(E, BUILT) the offsets of that structure, and of the estimate's own: see `Equations`."""
+        """(E, BUILT) the offsets of that structure, and those of the estimate's own structure: see `Equations`."""
         return self.equations.slots(self.whole_structure), self.equations.slots(self.estimate.structure)
 
     def effect(self, shift: Array, rows: Mask) -> tuple[float, float, int]:
-        """What a displacement (E,) px does to the observations of some equations: its root mean square over them in the
-        image, px, and on their targets' planes, mm; and how many they are.
+        """The effect of a displacement (E,) px on the observations of some equations: its root mean square in the
+        image, px, and on their targets' planes, mm; and the number of these observations.
         """
         count = len(distinct(self.equations.observation[rows]))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -187,28 +192,28 @@ class Case(Frozen):
         return float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count
 
     def noise_px(self, left_over: Array, rows: Mask) -> float:
-        """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
+        """Root mean square (px) over observations of what is left over, (E,) in standard deviations."""
         count = len(distinct(self.equations.observation[rows]))
         return float(np.sqrt(np.sum((left_over / self.model.weight)[rows] ** 2) / count))
 
     def free_coefficients(self, camera: str) -> set[str]:
-        """Names of those that the lens solves for."""
+        """Names of the lens coefficients that are solved for."""
         lens = self.estimate.cameras[camera].lens
         names = intrinsic_names(lens)
         return {names[number] for number in self.problem.layout.free[camera]} & set(lens.names)
 
 
 def half_diagonals(camera: Camera, pixels: Array) -> Array:
-    """(N, 2) of pixels (N, 2) from the principal point, in half image diagonals."""
+    """(N, 2) offsets of pixels (N, 2) from the principal point, in half image diagonals."""
     return np.asarray(camera.offsets(pixels) / unit_px(camera))
 
 
 class Evidence(Frozen):
-    """A group of an effect that the residuals speak for.
+    """A group of an effect that the residuals support.
 
     Attributes:
-        others: the model with the other chosen effects free. shift: (E,) px that it moves. effect: see `Case.effect`.
-        noise_ratio: its effect, px, over the noise of the same observations.
+        others: the model with the other chosen effects free. shift: (E,) px displacement. effect: see `Case.effect`.
+        noise_ratio: the effect in px over the noise of the same observations.
     """
 
     case: Case
@@ -220,28 +225,28 @@ class Evidence(Frozen):
 
     @property
     def in_mm(self) -> tuple[Array, Array]:
-        """Its amounts (Q,) and their standard deviations (Q,), of lengths in mm."""
+        """Its amounts (Q,) and their standard deviations (Q,) in mm, if they are lengths."""
         return 1e3 * self.score.amount, 1e3 * self.score.sd
 
     def words(self, sentence: str, advice: str, names: Iterable[str] = (), unit: str = "px") -> Words:
-        """What a finding says, its size behind the sentence; what would mend it are all its amounts, by their names."""
+        """The words of a finding: its size is added to the sentence; all amounts, by their names, would correct it."""
         values, sds = self.in_mm if unit in ("mm", "mrad") else (self.score.amount, self.score.sd)
         return Words(f"{sentence} ({self.size})", advice, amounts(names, values, sds, unit))
 
     @property
     def size(self) -> str:
-        """Its effect in words."""
+        """The effect in words."""
         px, mm, _ = self.effect
         digits = 1 if mm >= 0.1 else 2
         return f"{px:.2f} px, {mm:.{digits}f} mm rms, {two_digits(self.noise_ratio)} of the noise"
 
     def most_px(self, rows: Mask | bool = True) -> float:
-        """The largest displacement among some equations that take part."""
+        """The largest displacement (px) among the chosen equations that take part."""
         return float(np.max(np.abs((self.shift * rows)[self.case.model.used])))
 
 
 class Words(NamedTuple):
-    """What a finding says: its cause, what to do, and what would mend it."""
+    """The words of a finding: its cause, the advice, and the amounts that would correct it."""
 
     sentence: str
     advice: str
@@ -249,11 +254,11 @@ class Words(NamedTuple):
 
 
 Displaces = Callable[[Case, str, Array], Array | None]
-"""A displacement by case, camera and pixels, see `Effect`."""
+"""A function of case, camera and pixels that returns a displacement, see `Effect`."""
 
 
 def of_any_size(case: Case, camera: str) -> float:
-    """What is usual of amounts of which nothing is."""
+    """The usual size of amounts for which no size is usual."""
     return np.inf
 
 
@@ -261,17 +266,17 @@ class Effect(Frozen):
     """A row of the table of effects: what may displace the observations besides the free numbers.
 
     Attributes:
-        kind: its name. over: of a case, its columns over the equations. words: what the finding of one of its groups
-            says. absorbed: whether its displacement is what the calibration's free numbers could not have taken up of
-            it. wrong: what is where it is found, see `Finding`.
-        built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
-        displacement: of what a camera does to its picture besides, (N, 2, Q) px at its pixels (N, 2) per unit of its
+        kind: its name. over: the columns over the equations, by case. words: what the finding about one group says.
+            absorbed: whether its displacement is reported without what the calibration's free numbers could absorb.
+            wrong: what is wrong where it is found, see `Finding`.
+        built: the kind of a target's construction that `calibrate` solves for separately; "" for all other effects.
+        displacement: for an effect of a camera on its picture, (N, 2, Q) px at its pixels (N, 2) per unit of its
             amounts; None where the camera solves for them.
-        prior: what is expected of its amounts, in their own unit, of one whose size `calibrate` estimates: it solves
-            for it where it is likely, and states no number better than with it in doubt. reach: by how much more is
-            expected of a group, by how large what it is about is. concerns: whether it may displace any observations.
-        usual: of a case and a camera, the size that its amounts usually have, where `calibrate` estimates none.
-        together: the findings of several of its groups, as they are told.
+        prior: the prior on the size of its amounts, in their own unit, if `calibrate` estimates it: it solves for the
+            effect where that is likely, and else widens by it. reach: factor on that size for one group, from the size
+            of its subject. concerns: whether the effect may displace any of the observations.
+        usual: the usual size of its amounts by case and camera, where `calibrate` estimates none.
+        together: combines the findings of several of its groups into those that are reported.
     """
 
     kind: str
@@ -288,18 +293,18 @@ class Effect(Frozen):
     together: Callable[[Sequence[Finding]], Iterable[Finding]] = tuple
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
-        """Its columns over the equations."""
+        """The columns of the effect over the equations, with its kind."""
         for columns in self.over(case):
             yield replace(columns, kind=self.kind)
 
     def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
-        """The prior of one of its groups; None of a target as built of which somebody stated a tolerance."""
+        """The prior of one of its groups; None for a target as built whose tolerance is stated."""
         if self.prior is None or (self.built and columns.subjects[number] in case.problem.options.tolerances):
             return None
         return self.prior.times(self.reach(columns, number, case))
 
     def evidence(self, case: Case, score: ScoreTest, others: Linearised, left_over: Array) -> Evidence:
-        """For one of its groups, beside other effects in a model, which all together leave so much (E,)."""
+        """The evidence for one of its groups, beside other effects in a model; `left_over` (E,) is what all leave."""
         rows = np.any(score.columns != 0.0, axis=1) & case.model.used
         shift = score.columns @ score.amount
         if self.absorbed:
@@ -308,23 +313,23 @@ class Effect(Frozen):
         return Evidence(case, score, others, shift, effect, effect[0] / case.noise_px(left_over, rows))
 
     def findings(self, case: Case, selection: Selection) -> Iterator[Finding]:
-        """Of its groups that were chosen."""
+        """The findings of those of its groups that were chosen."""
         own = [number for number, score in enumerate(selection.chosen) if score.effect.kind == self.kind]
         yield from self.together([self._finding(case, selection, number) for number in own])
 
     def variances(self, case: Case, score: ScoreTest) -> Array:
-        """(Q,) expected of the amounts of a group, where anything is, or larger ones that they show: a bow of 24 ± 26
-        mm moves a camera by what floors have, not by 24 mm; nor does one of 150 ± 30 mm, which is something else that
-        looks like it. Infinite where nothing is expected.
+        """(Q,) expected variances of the amounts of a group: what the residuals show, within limits from the usual
+        size. A bow of 24 ± 26 mm moves a camera only by what floors usually have, and one of 150 ± 30 mm is something
+        else that looks like it. Infinite where no size is usual.
         """
-        most = 4.0  # times the usual size: 9 mm of a field of 9 m
+        most = 4.0  # largest size in usual sizes: 9 mm for a field of 9 m
         prior = self.prior_of(score.effect, score.number, case)
         usual = self.usual(case, score.subject) ** 2 if prior is None else float(np.mean(np.square(prior.sizes)))
         return np.clip(score.amount**2 - score.sd**2, usual, most**2 * usual)
 
     def is_implausible(self, case: Case, score: ScoreTest) -> bool:
-        """Whether amounts that are clear would be less than half as large under what is expected of their size."""
-        clear = 2.0  # standard deviations
+        """Whether amounts that are clearly not 0 would be less than half as large under the expected size."""
+        clear = 2.0  # standard deviations from which on an amount is clearly not 0
         return bool(np.any((np.abs(score.amount) > clear * score.sd) & (self.variances(case, score) < score.sd**2)))
 
     def _finding(self, case: Case, selection: Selection, number: int) -> Finding:
@@ -352,7 +357,7 @@ def camera_effect(
     words: Callable[[Evidence], Words],
     usual: Callable[[Case, str], float] = of_any_size,
 ) -> Effect:
-    """What a camera does to its picture besides."""
+    """An effect of a camera on its picture."""
     over = partial(_over_cameras, displacement)
     return Effect(kind, over, words, absorbed=True, displacement=displacement, usual=usual)
 

@@ -1,20 +1,20 @@
-"""Groups of equations against each other: what a solve without one of them would leave of it, and how they scatter.
+"""Compare groups of equations: what a solve without one of them would leave of it, and how the groups scatter.
 
-With A_g the normal equations of a group, u_g its gradient and M the sum of all, leaving the group out moves the free
-numbers by (M - A_g)^-1 u_g. As everything is quadratic, some of the numbers may be held elsewhere instead: a shorter
-lens is the longer one with coefficients at 0, and needs no solve of its own.
+With A_g the normal equations of a group, u_g its gradient and M the sum over all groups, leaving the group out moves
+the free numbers by (M - A_g)^-1 u_g. As everything is quadratic, some of the numbers may be held elsewhere instead: a
+shorter lens is the longer one with coefficients at 0, and needs no solve of its own.
 
-Do views scatter as their own equations say? At the optimum their gradients add up to nothing. With A_g the information
-of each where errors are independent, M_g the covariance of its gradient and M that of all of them, in directions in
-which everything together is known to one, the optimum leaves
+Do views scatter as their own equations say? At the optimum their gradients sum to zero. With A_g the information of
+each view if errors are independent, M_g the covariance of its gradient and M that of all of them, in directions in
+which the information of everything is the unit matrix, the optimum leaves
 
     Cov(u_g, u_h) = d_gh M_g - A_g M_h - M_g A_h + A_g M A_h.
 
-Their mean square over what is expected is the factor c on the variance, whose own spread follows from the same matrices
-(Satterthwaite). The jackknife (1 - A_g)^-1 u_g, by which the optimum moves without a view, says in which directions
-they scatter (CR3; Bell and McCaffrey, Survey Methodology 28, 2002). With few views, or one that says most, it is
-singular and overshoots: it counts as far as views disagree at all, and as much as G - 1 of G - 1 + P numbers with G the
-number of views that would say as much if all said the same.
+The mean square of the gradients over its expectation is the factor c on the variance, whose own spread follows from the
+same matrices (Satterthwaite). The jackknife (1 - A_g)^-1 u_g, by which the optimum moves without a view, shows in which
+directions views scatter (CR3; Bell and McCaffrey, Survey Methodology 28, 2002). With few views, or one that dominates,
+it is singular and overshoots. So its weight is the probability that views disagree at all, times (G - 1) / (G - 1 + P)
+for P numbers, with G the number of equally informative views that would say as much.
 """
 
 from __future__ import annotations
@@ -30,24 +30,25 @@ from ceres_cal.observations.sights import Owner, SightKey, Sights
 from ceres_cal.problem import Estimate, Key, Problem, free_keys
 from ceres_cal.problem.reduced import normals_with_residuals, owned_columns, steps_of
 
-_RIDGE = 1e-3  # of everything's information: a group that tells a direction alone cannot be left out
+_RIDGE = 1e-3  # share added to the total information: a group that alone determines a direction cannot be left out
 
 
 FEWEST_GROUPS = 3
-# Equations that groups leave between them: views that each tell numbers of their own, as of cameras side by side, leave
-# rounding, and the ratio to that was 17 000 where nothing was wrong.
+# Expected squares between groups, in degrees of freedom, below which they cannot be compared. Views that each determine
+# their own numbers, as of cameras side by side, leave only rounding: the ratio to that was 17 000 where nothing was
+# wrong.
 _LEAST_LEFT = 1.0
-_LOG_C = np.linspace(0.02, 6.0, 300)  # either way exponential of mean 1, where views do not scatter as expected
+_LOG_C = np.linspace(0.02, 6.0, 300)  # of either sign, with an exponential prior of mean 1 if views scatter otherwise
 
 
 class GroupNormals(Frozen):
     """Normal equations of G groups of equations over K numbers, in standard deviations.
 
     Attributes:
-        keys: their names, none of directions. normal: (G, K, K). gradient: (G, K) half the derivative of the squared
-            residuals. squares: (G,) these.
-        counts: (G,) equations. known, known_gradient: (K, K), (K,) of priors. sizes: (K,) squared lengths of the
-            columns, before anything was eliminated.
+        keys: the numbers; empty for directions. normal: (G, K, K). gradient: (G, K) half the derivative of the sum of
+            squared residuals. squares: (G,) that sum.
+        counts: (G,) numbers of equations. known, known_gradient: (K, K), (K,) of priors. sizes: (K,) squared lengths of
+            the columns before anything was eliminated.
     """
 
     keys: tuple[Key, ...]
@@ -61,7 +62,7 @@ class GroupNormals(Frozen):
 
     @classmethod
     def of(cls, model: Linearised, group: Indices, known: Array) -> GroupNormals:
-        """Of the directions of a linear model, by group (E,), beside what was known of them before, (P, P)."""
+        """Those of the shared directions of a linear model, by group (E,), with prior information (P, P) on them."""
         order = np.argsort(group, kind="stable")
         columns = model.columns[order, 6:]
         counts = np.bincount(group)
@@ -72,19 +73,19 @@ class GroupNormals(Frozen):
 
     @property
     def least(self) -> float:
-        """The least squares, everything free."""
+        """The least sum of squares, with everything free."""
         return self.squares_at(self._least_step)
 
     def squares_at(self, step: Array) -> float:
-        """All squares, so far from where the numbers stand, to second order."""
+        """The sum of all squares at a step from the present numbers, to second order."""
         return float(self.squares.sum() + 2.0 * (self._slope @ step) + step @ self._whole @ step)
 
     def scatter_of(self, numbers: Indices) -> float:
-        """Mean of the variances of some of the numbers as groups scatter, over those by the noise alone.
+        """Mean variance of some of the numbers by the scatter of groups, over that by the noise alone.
 
-        Each group's residuals are taken as large as without its own share in the fit (CR2: Bell and McCaffrey, Survey
-        Methodology 28, 2002), so that it is 1 on average where errors are independent, however few groups there are.
-        The jackknife divides by that share twice, and overshoots where one group nearly alone tells a direction.
+        Each group's residuals are enlarged by its own share in the fit (CR2: Bell and McCaffrey, Survey Methodology 28,
+        2002), so that the result is 1 on average where errors are independent, however few groups there are. The
+        jackknife divides by that share twice, and overshoots where one group nearly alone determines a direction.
         """
         axes = np.linalg.qr(self._root[numbers].T)[0]
         gradient = (self.gradient + self.normal @ self._least_step) @ self._root
@@ -94,8 +95,8 @@ class GroupNormals(Frozen):
         return float(len(moved) * np.mean(moved**2))
 
     def held_out(self, every: Sequence[Mapping[Key, float]]) -> tuple[Array, Array]:
-        """(F, G) squared errors of each group predicted from all others, and the steps (F, K) to where the least
-        squares are, when some of the numbers are held so far from where they stand, in one way or another.
+        """(F, G) squared errors of each group predicted from all others, and the steps (F, K) to the least squares, if
+        some numbers are held at given distances from their present values; one row for each of F choices.
         """
         steps = np.array([[held.get(key, 0.0) for key in self.keys] for held in every])
         roots = self._roots(every)
@@ -109,22 +110,22 @@ class GroupNormals(Frozen):
         return squares, steps
 
     def root(self, held: Collection[Key], stated: Array | float = 0.0) -> Array:
-        """(K, K) a root of the covariance of the numbers, when some are held.
+        """(K, K) a root of the covariance of the numbers, if some are held.
 
         Args:
-            stated: (K, K) information that there is of them besides.
+            stated: (K, K) further information on the numbers.
         """
         return np.asarray(self._roots([held], stated)[0])
 
     def _roots(self, every: Sequence[Collection[Key]], stated: Array | float = 0.0) -> Array:
-        """(F, K, K) the same, when these or those are held."""
+        """(F, K, K) the roots for each of F choices of held numbers."""
         free = np.array([[key not in held for key in self.keys] for held in every])
         normals = (self._whole + stated) * (free[:, :, None] & free[:, None, :])
         return np.asarray(inverse_roots(normals, self.sizes, SINGULAR)[0] * free[:, :, None])
 
     def _split(self, roots: Array) -> tuple[Array, Array]:
-        """(..., G, R, R) each group's share of the information along roots (..., K, R) of everything's, and that of all
-        others.
+        """(..., G, R, R) the share of each group in the information along roots (..., K, R) of the whole, and that of
+        all other groups.
         """
         each = roots[..., None, :, :]
         own = np.swapaxes(each, -1, -2) @ self.normal @ each
@@ -148,11 +149,11 @@ class GroupNormals(Frozen):
 
 
 def group_normals(problem: Problem, estimate: Estimate, groups: Sights, alone: Set[str | None]) -> GroupNormals:
-    """The normal equations of each group.
+    """Compute the normal equations of each group.
 
     Args:
-        groups: a sight is a group; several may have the same pose. alone: the private placements that one group alone
-            shows: each is posed from it.
+        groups: each sight is a group; several may have the same pose. alone: the private placements that only one group
+            shows; each pose is determined by its group.
 
     Raises:
         SolutionError: an observation cannot be projected.
@@ -189,7 +190,7 @@ def group_normals(problem: Problem, estimate: Estimate, groups: Sights, alone: S
 
 
 def _alike(groups: Sights, alone: Set[str | None]) -> Iterator[Indices]:
-    """Numbers of the groups that depend on the same numbers in the same way."""
+    """Numbers of the groups that depend on the same numbers in the same way, together."""
     every: dict[SightKey | str, list[int]] = {}
     for number, key in enumerate(groups.keys):
         every.setdefault(key.camera if key.placement in alone else key, []).append(number)
@@ -197,8 +198,10 @@ def _alike(groups: Sights, alone: Set[str | None]) -> Iterator[Indices]:
 
 
 def _drop_rounding(columns: Mapping[Owner, Indices], sizes: Array, products: Array) -> None:
-    """Take what is left of a turn that nothing tells, which is rounding of the others, out of sizes and products."""
-    rounding = 1e-12  # of a sum over a group's rows
+    """Set to 0 in sizes and products what is left of a rotation that nothing determines: it is rounding of the
+    others.
+    """
+    rounding = 1e-12  # share of a sum over the rows of a group
     for (kind, _), own in columns.items():
         for alike in (own[:3], own[3:]) if kind in ("station", "placement") else ():
             lost = alike[sizes[alike] <= rounding * np.max(sizes[alike])]
@@ -206,7 +209,7 @@ def _drop_rounding(columns: Mapping[Owner, Indices], sizes: Array, products: Arr
 
 
 def posed(normals: Array) -> Array:
-    """(G, K - 6, K - 6) what normal equations (G, K, K) leave where each pose is at its best."""
+    """(G, K - 6, K - 6) what normal equations (G, K, K) leave when each pose is at its best value."""
     pose, rest = slice(-7, -1), np.r_[: normals.shape[1] - 7, normals.shape[1] - 1]
     inverse = known_inverses(normals[:, pose, pose], np.full(6, np.inf))
     across = normals[:, pose][:, :, rest]
@@ -220,8 +223,8 @@ class GroupScatter(Frozen, eq=True):
     """How views or placements scatter.
 
     Attributes:
-        groups: how many were compared. variance: factor on the variance, beyond what errors within them do.
-        probability: that it is not 1. degrees_of_freedom: behind it.
+        groups: number of groups compared. variance: factor on the variance, beyond the effect of errors within groups.
+        probability: that the factor is not 1. degrees_of_freedom: those of the factor.
     """
 
     groups: int
@@ -231,18 +234,18 @@ class GroupScatter(Frozen, eq=True):
 
 
 def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[GroupScatter, Array] | None:
-    """How the groups scatter, and the covariance (P, P) of the whole score with that in it; None where they have too
-    little in common to be compared.
+    """How the groups scatter, and the covariance (P, P) of the whole score that includes this; None where the groups
+    have too little in common to be compared.
 
     Args:
-        groups: in directions in which everything is known to one.
-        scatter: (G, P, P) covariance of each group's score, by errors within it.
-        whole: (P, P) of all of them and of the priors.
+        groups: in directions in which the information of everything is the unit matrix.
+        scatter: (G, P, P) covariance of each group's score due to errors within it.
+        whole: (P, P) that of all groups and of the priors.
     """
     values, vectors = np.linalg.eigh(whole)
     values = np.maximum(values, 1e-12 * values[-1])
     white, root = (vectors * values**-0.5) @ vectors.T, (vectors * values**0.5) @ vectors.T
-    seen = _seen_by(groups)  # of the placements of a rig only those of the views that are asked
+    seen = _seen_by(groups)  # of the placements of a rig, only those in the sampled views
     turn, own_white = np.linalg.qr(white @ seen)
     normal, gradient = seen.T @ groups.normal @ seen, groups.gradient @ seen
     expected, spread = _expected(normal, seen.T @ scatter @ seen, seen.T @ whole @ seen, own_white.T)
@@ -254,7 +257,7 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
     size, traces = len(whole), np.trace(groups.normal, axis1=1, axis2=2)
     alike = (
         float(np.sum(traces) ** 2 / np.sum(traces**2)) - 1.0
-    )  # groups beyond the first that say as much as one another
+    )  # number of equally informative groups beyond the first
     weight = probability * alike / (alike + size)
     jackknife = size * turn @ _jackknife(normal, gradient, expected, own_white.T) @ turn.T
     factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife
@@ -263,14 +266,16 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
 
 
 def _seen_by(groups: GroupNormals) -> Array:
-    """(P, R) an orthonormal basis of the directions that any of the groups tells of."""
-    rounding = 1e-13  # of the direction that they tell most of
+    """(P, R) an orthonormal basis of the directions that any of the groups determines."""
+    rounding = 1e-13  # share of the largest eigenvalue
     values, vectors = np.linalg.eigh(groups.normal.sum(axis=0))
     return np.asarray(vectors[:, values > rounding * values[-1]])
 
 
 def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:
-    """(G, R, R) covariance of each group's score, whitened, and the variance of the sum of their squared lengths."""
+    """(G, R, R) covariance of each group's score, whitened, and the variance of the sum of the scores' squared
+    lengths.
+    """
     a, m, size = informations @ white, scatter @ white, len(white)
     left = np.concatenate([a, -m], axis=1)  # Cov(g_i, g_j) is left_i^T right_j for others, and more for i = j
     right = np.concatenate([whole @ a - m, a], axis=1)
@@ -282,11 +287,11 @@ def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -
 
 
 def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, float]:
-    """Mean of the factor on the variance over what it may be, given a chi-squared ratio; and that it is not 1.
+    """Posterior mean of the factor on the variance, given a chi-squared ratio, and the probability that it is not 1.
 
     Args:
-        widened: factor on the variance by errors within the views. No more than that is taken back where the views
-            agree better than it says: what looks like an error of each view is then one of all of them.
+        widened: factor on the variance due to errors within the views. Where views agree better than that, no more than
+            this is taken back: an apparent error of each view is then one of all views.
     """
     logs = np.concatenate([[0.0], _LOG_C, -_LOG_C])
     prior = np.exp(-np.abs(logs)) * (logs >= -np.log(max(widened, 1.0)))
@@ -299,7 +304,7 @@ def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, floa
 
 
 def _jackknife(normal: Array, gradient: Array, expected: Array, white: Array) -> Array:
-    """(R, R) how leaving out one group after the other moves it, whitened; of trace 1 on average where they agree."""
+    """(R, R) jackknife covariance from leaving out each group, whitened; its mean trace is 1 where the groups agree."""
     moves = white.T @ np.linalg.inv((1.0 + _RIDGE) * np.eye(len(white)) - normal)
     steps = np.einsum("gij,gj->gi", moves, gradient)
     turned = moves @ np.linalg.inv(white.T)
@@ -307,7 +312,7 @@ def _jackknife(normal: Array, gradient: Array, expected: Array, white: Array) ->
 
 
 def _widened(factor: Array, observed: Array) -> Array:
-    """The unit matrix with the factor on its part that observations say; what priors say is not theirs."""
+    """The unit matrix with the factor applied to the part that observations determine; priors are not affected."""
     values, vectors = np.linalg.eigh(observed)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return np.asarray(np.eye(len(factor)) + root @ (factor - np.eye(len(factor))) @ root)

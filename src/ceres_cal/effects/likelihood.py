@@ -1,8 +1,8 @@
 """The restricted likelihood of correlated errors (Patterson and Thompson, Biometrika 58, 1971), over a grid.
 
 The covariance of a strand's residuals is R = s^2 [(1 - a) 1 + a exp(-d / l)]. One set of eigenvectors serves all shares
-a of a length l, and all strands of one shape. Private placements are eliminated, and what all other rows and the priors
-say of the shared numbers is a prior here.
+a of a length l, and all strands of one shape. Private placements are eliminated. All other rows and the priors enter as
+prior information on the shared numbers.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from ceres_cal.kernels import strands_left
 from ceres_cal.observations import joined
 from ceres_cal.problem.costs import NORMAL_NS
 
-# To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %.
+# Shares a of the grid, up to 0.995: with at most 0.95, intervals for lines that bend over 2 m cover only 84 to 88 %.
 _SHARES = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.995])
 
 
 class Likelihoods(Frozen):
-    """N places on the grid.
+    """The likelihood at N places on the grid.
 
     Attributes:
-        family: (N,) its number. smooth: (N,) whether errors have no edges. length_m, share: (N,).
-        log: (N,) the likelihood's logarithm. variance: (N,) s^2. trace: (N,) of the scores' covariance.
-        inverse_freedom: (N,) of that.
+        family: (N,) number of the family. smooth: (N,) whether errors have no edges. length_m, share: (N,) l and a.
+        log: (N,) logarithm of the likelihood. variance: (N,) s^2. trace: (N,) of the covariance of the scores.
+        inverse_freedom: (N,) 1 / degrees of freedom of that trace.
     """
 
     family: Indices
@@ -42,11 +42,11 @@ class Likelihoods(Frozen):
 
 
 def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: float) -> Likelihoods:
-    """Of independent errors first, then of those that go together in one of the families.
+    """The likelihood of independent errors first, then of errors that are correlated in one of the families.
 
     Args:
-        may_be_smooth: whether errors without edges are looked for, too.
-        squared: sum of the squared shared columns over all rows, of which the families show some.
+        may_be_smooth: whether errors without edges are considered, too.
+        squared: sum of the squared shared columns over all rows, of which the families have some.
     """
     places = [(0, False, 0.0)]
     for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
@@ -60,12 +60,12 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
 
 
 def _lengths(family: StrandFamily) -> list[float]:
-    """The lengths of a family's grid, m."""
+    """The correlation lengths of a family's grid, m."""
     gap, longest = family.gap, family.longest
     if gap == 0.0:
         return []
     lengths = 0.5 * gap * 2.0 ** np.arange(np.ceil(np.log2(3.0 * longest / gap)))
-    if not np.any(family.columns[:, 0, :6]):  # a pose of its own takes up what moves the whole
+    if not np.any(family.columns[:, 0, :6]):  # else a pose of its own absorbs errors of the whole strand
         lengths = np.append(lengths, ASIDE * longest)
     return list(lengths.tolist())
 
@@ -74,10 +74,11 @@ def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: fl
     """The restricted likelihood at one place for all shares.
 
     Args:
-        place: number of the family, whether errors have no edges, length; 0 of none, which has no share.
+        place: number of the family, whether errors have no edges, and the length; a length of 0 stands for independent
+            errors, which have no share.
     """
     shares = _SHARES if place[2] else np.zeros(1)
-    fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
+    fewest_freedom = 3.0  # least degrees of freedom of a variance
     size, count, many = family.columns.shape[2] - 7, int(np.count_nonzero(family.filled)), len(shares)
     values, vectors = np.linalg.eigh(decay(family.distance, place[2] or 1.0, place[1]))
     values, rows = np.maximum(values, 0.0), np.swapaxes(family.applied(np.swapaxes(vectors, 1, 2)), 0, 1)
@@ -91,19 +92,21 @@ def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: fl
     squares = float(np.diff(family.bounds) @ np.sum(values**2, axis=1))
     few = max(count**2 / squares - (0 if taken else size), fewest_freedom)
     inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
-    scale = squared / max(white, 1e-300)  # of all rows to those looked at
+    scale = squared / max(white, 1e-300)  # ratio of all rows to those in the families
     number, smooth, length_m = (np.full(many, one) for one in place)
     trace = scale * (parts[0] + parts[1])
     return Likelihoods(number, smooth, length_m, shares, log - 0.5 * logs, variance, trace, inverse)
 
 
 def _left(family: StrandFamily, shared: Array, weights: Array) -> Array:
-    """(A, Q, Q) X^T R^-1 X of shared columns (M, S, Q) along the eigenvectors, with weights (A, D, M) of each shape."""
+    """(A, Q, Q) X^T R^-1 X for shared columns (M, S, Q) along the eigenvectors, with weights (A, D, M) of each
+    shape.
+    """
     each = np.diff(family.bounds)
-    if 8 * len(each) > shared.shape[1]:  # else the products of all strands of a shape serve all shares, in half or less
+    if 8 * len(each) > shared.shape[1]:  # else products over the strands of a shape serve all shares, in half the time
         every, flat = np.repeat(np.swapaxes(weights, 1, 2), each, axis=2), shared.reshape(-1, shared.shape[2])
         halves = (flat * root.reshape(-1, 1) for root in np.sqrt(every))
-        return np.array([half.T @ half for half in halves])  # which BLAS knows to be symmetric
+        return np.array([half.T @ half for half in halves])  # BLAS computes this as a symmetric product
     products = (np.swapaxes(shared[:, own], 1, 2) @ shared[:, own] for own in family.of_shape)
     return np.asarray(sum(np.tensordot(weights[:, d], product, 1) for d, product in enumerate(products)))
 
@@ -111,7 +114,7 @@ def _left(family: StrandFamily, shared: Array, weights: Array) -> Array:
 def _restricted(family: StrandFamily, reduced: Array, count: int) -> tuple[Array, Array, float]:
     """Logarithm of the restricted likelihood (A,) without the determinant of R, s^2 (A,), and its degrees of freedom.
 
-    What all other rows and the priors say of the shared numbers is a prior here; the whole is at its optimum.
+    All other rows and the priors enter as prior information on the shared numbers; the whole is at its optimum.
     """
     own = family.products[6:, 6:]
     normal = np.eye(len(own) - 1) - own[:-1, :-1] + reduced[:, :-1, :-1]

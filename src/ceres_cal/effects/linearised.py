@@ -1,10 +1,10 @@
-"""What the free numbers of a calibration can take up of the residuals, and what they must leave.
+"""The linear model of a calibration: what its free numbers can absorb of the residuals, and what they must leave.
 
-The linear model of the bundle at its end, in standard deviations: placements that one sight shows are projected out
-sight by sight, everything shared by one triangular factor, priors as equations of their own. Then a column over the
-equations (an alternative to the model) has a part that the calibration would have absorbed and a part that it cannot;
-the score test (Rao 1948) looks at the second part alone. It is the only linear model: of all equations or of those of
-some sights, in directions of what all of them know (`linearise_within`) or of what these know by themselves.
+It is the linearised bundle at the end of a solve, in standard deviations: placements that one sight shows are projected
+out sight by sight, everything shared by one triangular factor, and priors are equations of their own. A column over the
+equations (an alternative to the model) then has a part that the calibration would have absorbed and a part that it
+cannot absorb; the score test (Rao 1948) uses only the second. This is the only linear model: of all equations or of
+those of some sights, in directions of what all equations know (`linearise_within`) or of what these know by themselves.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ceres_cal.problem.quantities import free_keys, from_placement, from_station
 from ceres_cal.problem.residuals import Equations, Residuals, of_observations, pairs_of
 
 LEAST_LEFT = 1e-7
-"""Share of an alternative's squared length that the free numbers must leave for it to be testable."""
+"""Share of a column's squared length that the free numbers must leave for the alternative to be testable."""
 SINGULAR = 1e-12
-"""Share of its own information that a number must keep beside the others."""
+"""Share of its own information that a number must keep beside the others to count as determined."""
 
 
 class Weights(Frozen):
-    """How the E equations count.
+    """The weights of E equations.
 
     Attributes:
-        inverse_sigma: (E,) 1 / standard deviation, px^-1. used: (E,) which take part. robust: (E,) rho' of each
-            equation's observation.
+        inverse_sigma: (E,) 1 / standard deviation, px^-1. used: (E,) which equations take part. robust: (E,) rho' of
+            the observation of each equation.
     """
 
     inverse_sigma: Array
@@ -40,17 +40,17 @@ class Weights(Frozen):
 
     @property
     def within_sigma(self) -> Weights:
-        """The same with the robust weights in the standard deviations, as the solver sees them."""
+        """The same with the robust weights included in the standard deviations, as the solver has them."""
         return Weights(self.inverse_sigma * np.sqrt(self.robust), self.used, np.ones_like(self.robust))
 
 
 class AddedNumbers(Frozen):
-    """What Q more free numbers would do to a model.
+    """The result of adding Q free numbers to a model.
 
     Attributes:
-        rest: (E, Q) their columns, in standard deviations, beyond private placements. taken: (P, Q) what its shared
-            directions take of them. root: (Q, R) a root of their covariance, of what is determined. step: (R,) how far
-            they are from their best values.
+        rest: (E, Q) their columns, in standard deviations, beyond private placements. taken: (P, Q) the part of these
+            columns along the model's shared directions. root: (Q, R) root of their covariance, where they are
+            determined. step: (R,) minus their best values, in these directions.
     """
 
     rest: Array
@@ -60,37 +60,37 @@ class AddedNumbers(Frozen):
 
     @property
     def amount(self) -> Array:
-        """(Q,) what brings them to their best values; 0 for what cannot be determined."""
+        """(Q,) their best values; 0 where they cannot be determined."""
         return -self.root @ self.step
 
     @property
     def sd(self) -> Array:
-        """(Q,) its standard deviations, infinite for what cannot be determined."""
+        """(Q,) standard deviations of the best values; infinite where they cannot be determined."""
         return np.where(np.any(self.root != 0.0, axis=1), np.sqrt(np.sum(self.root**2, axis=1)), np.inf)
 
     def under(self, variances: Array) -> Array:
-        """(Q,) what brings them to their likeliest values under variances (Q,) that are expected of these."""
+        """(Q,) their likeliest values, if variances (Q,) are expected of them."""
         within = np.eye(len(self.step)) + (self.root.T / variances) @ self.root
         return np.asarray(-self.root @ np.linalg.solve(within, self.step))
 
     @property
     def decrease(self) -> float:
-        """By how much the squared residuals fall."""
+        """By how much the sum of squared residuals falls."""
         return float(self.step @ self.step)
 
 
 class Linearised(Frozen):
-    """Equations in standard deviations, and an orthonormal basis of what the free numbers do to them.
+    """Equations in standard deviations, with an orthonormal basis of how the free numbers move them.
 
     Attributes:
         weight: (E,) 1 / standard deviation, px^-1. used: (E,) which equations take part.
         score: (E,) robust residuals, in standard deviations; 0 where an equation is not used.
-        private: (E, 6) basis of what each private placement does to its sight's equations, 0 elsewhere.
-        shared: (E, P) basis of what shared numbers do beyond that; with priors of less than unit length.
-        root: (K, P) from these directions to the K shared numbers.
-        step: (P,) how far each direction of `shared` is from its best value, in standard deviations.
-        unknowns: how many free numbers the equations determine. prior_equations: how many equations priors add.
-        known_noise: equations that what was known of the noise before counts as.
+        private: (E, 6) basis of how each private placement moves its sight's equations, 0 elsewhere.
+        shared: (E, P) basis of how shared numbers move the equations beyond that; less than unit length with priors.
+        root: (K, P) maps these directions to the K shared numbers.
+        step: (P,) distance of each direction of `shared` from its best value, in standard deviations.
+        unknowns: number of free numbers that the equations determine. prior_equations: number of equations of priors.
+        known_noise: number of equations for which prior knowledge of the noise counts.
     """
 
     equations: Equations
@@ -107,11 +107,11 @@ class Linearised(Frozen):
 
     @property
     def spare(self) -> int:
-        """Equations left over, priors counted."""
+        """Degrees of freedom, with the equations of priors."""
         return int(np.count_nonzero(self.used)) + self.prior_equations - self.unknowns
 
     def beyond_private(self, columns: Array) -> Array:
-        """Columns (E, Q), in standard deviations, without what private placements take up."""
+        """Columns (E, Q), in standard deviations, without what private placements absorb."""
         if not self._private_ranges:
             return columns
         rest = columns.copy()
@@ -138,21 +138,21 @@ class Linearised(Frozen):
 
     @cached_property
     def placed_score(self) -> Array:
-        """(E,) `score` with every private placement at its best."""
+        """(E,) `score` with every private placement at its best value."""
         return self.beyond_private(self.score[:, None])[:, 0]
 
     @cached_property
     def columns(self) -> Array:
-        """(E, 6 + P + 1) private, shared, and `placed_score`."""
+        """(E, 6 + P + 1) the columns of `private` and `shared`, and `placed_score`."""
         return np.column_stack([self.private, self.shared, self.placed_score])
 
     @cached_property
     def left_over(self) -> Array:
-        """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
+        """(E,) the residuals, in standard deviations, with every free number at its best value; 0 where not used."""
         return np.where(self.used, self.placed_score - self.shared @ self.step, 0.0)
 
     def freed(self, columns: Array, sigma: float = np.inf) -> AddedNumbers:
-        """More numbers to be free besides, or to scatter by sigma about nought: columns (E, Q), px per unit."""
+        """Add numbers, with columns (E, Q) in px per unit, that are free, or normal about 0 with a given sigma."""
         scaled = columns * self.weight[:, None]
         rest, taken = self._projected(scaled)
         normal, slope = self._normal(rest, taken)
@@ -161,8 +161,8 @@ class Linearised(Frozen):
         return AddedNumbers(rest, taken, root, root.T @ slope)
 
     def left_of(self, columns: Array) -> tuple[Array, Array]:
-        """Normal equations (Q, Q) of more numbers, columns (E, Q), px per unit, once everything free followed them; and
-        half the derivative (Q,) of the squared residuals by them.
+        """Normal equations (Q, Q) of more numbers, with columns (E, Q) in px per unit, after everything free has
+        followed them, and half the derivative (Q,) of the sum of squared residuals by them.
         """
         return self._normal(*self._projected(columns * self.weight[:, None]))
 
@@ -171,15 +171,15 @@ class Linearised(Frozen):
         return inside.T @ inside - taken.T @ taken, inside.T @ self.score[self.used] - taken.T @ self.step
 
     def beside_prior(self, prior: Array) -> Linearised:
-        """The same where these equations and a prior (P, P) in the directions of `shared` are all that is known: in
-        directions in which they know everything to one, from where the equations' least squares are.
+        """The model if these equations and a prior (P, P) in the directions of `shared` are all that is known: in
+        directions in which their information is the unit matrix, with steps from the least squares of the equations.
         """
         back = inverse_root_of(self.shared.T @ self.shared + prior).T
         shared = self.shared @ back
         return replace(self, shared=shared, root=self.root @ back, step=shared.T @ self.placed_score)
 
     def with_columns(self, columns: Array, sigma: float = np.inf) -> Linearised:
-        """The same model with these numbers free, or scattering by sigma about nought."""
+        """The model with more numbers free, or normal about 0 with a given sigma; columns (E, Q) in px per unit."""
         more = self.freed(columns, sigma)
         basis = (more.rest - self.shared @ more.taken) @ more.root
         return replace(
@@ -191,50 +191,48 @@ class Linearised(Frozen):
         )
 
     def decreases(self, columns: Array) -> Array:
-        """(Q,) by how much the squared residuals fall with each of the columns (E, Q), px per unit, alone."""
+        """(Q,) by how much the sum of squared residuals falls with each single one of columns (E, Q), px per unit."""
         normal, slope = self.left_of(columns)
         left, scaled = np.diagonal(normal), columns[self.used] * self.weight[self.used, None]
         determined = left > LEAST_LEFT * np.sum(scaled**2, axis=0)
         return np.where(determined, slope**2 / np.where(determined, left, 1.0), 0.0)
 
     def taken_by(self, columns: Array) -> Array:
-        """(K, Q) how the shared numbers move with more numbers, columns (E, Q), px per unit, that are at one."""
+        """(K, Q) by how much the shared numbers move per unit of more numbers, with columns (E, Q) in px per unit."""
         return -self.root @ self._projected(columns * self.weight[:, None])[1]
 
     def left_of_column(self, column: Array) -> Array:
-        """(E,) what is left of a column, in standard deviations, once everything free followed it."""
+        """(E,) what is left of a column, in standard deviations, after everything free has followed it."""
         rest, taken = self._projected(column[:, None])
         return np.asarray(rest[:, 0] - self.shared @ taken[:, 0])
 
     def _projected(self, columns: Array) -> tuple[Array, Array]:
-        """Columns (E, Q), in standard deviations, beyond private placements, and what `shared` takes of them (P, Q)."""
+        """Columns (E, Q), in standard deviations, beyond private placements, and their part (P, Q) along `shared`."""
         rest = self.beyond_private(columns)
         return rest, self.shared.T @ (rest * self.used[:, None])
 
     @cached_property
     def leverage(self) -> Array:
-        """(E,) the share of each equation that went into the fit; of unused ones, how much the fit's own uncertainty
-        adds to their variance.
-        """
+        """(E,) leverage of each equation; for unused ones, what the uncertainty of the fit adds to the variance."""
         return np.asarray(np.sum(self.private**2, axis=1) + np.sum(self.shared**2, axis=1))
 
     @cached_property
     def studentised(self) -> tuple[Indices, Array]:
-        """See `studentised`: of every observation, which it is and its length."""
+        """The numbers of all observations, and the lengths of their deleted residuals; see `studentised`."""
         pairs = pairs_of(self.equations)
         residual = self.weight * self.equations.residual
         return studentised(self.equations, residual, self.used.astype(float), self.leverage, self.overlap(*pairs))
 
     def spare_of(self, rows: Mask) -> float:
-        """How many of these equations (E,) are left over for the noise."""
+        """Degrees of freedom of some equations (E,): their number less their leverages."""
         return float(np.sum(1.0 - self.leverage[rows]))
 
     def variance(self, rows: Mask) -> float:
-        """Mean square of what is left of these equations (E,), in squared standard deviations."""
+        """Mean square per degree of freedom of what is left of some equations (E,), in squared standard deviations."""
         return float(np.sum(self.left_over[rows] ** 2)) / max(self.spare_of(rows), 1e-9)
 
     def overlap(self, first: Indices, second: Indices) -> Array:
-        """Entries of the hat matrix between pairs of equations of one sight, (N,)."""
+        """(N,) entries of the hat matrix between pairs of equations of one sight."""
         private = np.sum(self.private[first] * self.private[second], axis=1)
         return np.asarray(private + np.sum(self.shared[first] * self.shared[second], axis=1))
 
@@ -242,15 +240,16 @@ class Linearised(Frozen):
 def studentised(
     equations: Equations, residual: Array, share: Array, leverage: Array, overlap: Array
 ) -> tuple[Indices, Array]:
-    """Deleted residuals over their standard deviations: how far off each observation is where the others alone predict
-    it (Cook and Weisberg 1982, 2.2).
+    """Studentised deleted residuals: the distance of each observation from the prediction of all others, in standard
+    deviations (Cook and Weisberg 1982, 2.2).
 
-    With M what the fit's covariance makes of its variance, and with a weight w in the fit, e' (I - w M)^-1 (I + (1 - w)
-    M)^-1 e as a length: e' (I - M)^-1 e of one that counts in full, e' (I + M)^-1 e of one that took no part.
+    With M the variance that the covariance of the fit adds, and a weight w in the fit, the squared length is e' (I - w
+    M)^-1 (I + (1 - w) M)^-1 e: e' (I - M)^-1 e for an observation of full weight, e' (I + M)^-1 e for one that took no
+    part.
 
     Args:
-        residual: (E,) in standard deviations. share: (E,) w. leverage, overlap: M's diagonal (E,), and (P,) its entry
-            between the two equations of each point.
+        residual: (E,) in standard deviations. share: (E,) w. leverage, overlap: the diagonal (E,) of M, and (P,) its
+            entry between the two equations of each point.
 
     Returns:
         (N,) the observations, and (N,) the lengths.
@@ -271,9 +270,9 @@ def studentised(
 
 
 def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
-    """W (Q, rank) with W W^T = normal^-1 on what is determined.
+    """W (Q, rank) with W W^T = normal^-1 over the directions that are determined.
 
-    Directions that keep less than `least` of `sizes`, the squared lengths before anything was projected out, are left
+    Directions that keep less than `least` of `sizes`, their squared lengths before anything was projected out, are left
     out.
     """
     root, rank = inverse_roots(normal, sizes, least)
@@ -281,7 +280,7 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
 
 
 def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, Indices]:
-    """The same of a stack (..., Q, Q): roots (..., Q, Q) whose first columns are 0 for what is left out, and ranks."""
+    """The same for a stack (..., Q, Q): roots (..., Q, Q), whose first columns are 0 if left out, and ranks."""
     scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
     values, vectors = np.linalg.eigh(scale[..., :, None] * normals * scale[..., None, :])
     kept = values > least
@@ -292,11 +291,11 @@ def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, In
 def equation_weights(
     weighting: Weighting, equations: Equations, there: Residuals, taking_part: tuple[Mask, Mask] | None = None
 ) -> Weights:
-    """How each equation counts at a noise and a loss.
+    """The weights of equations at a noise and a loss.
 
     Args:
-        there: residuals where the equations stand. taking_part: of points (N,) and of curve observations (M,); by
-            default all do.
+        there: residuals at the estimate of the equations. taking_part: masks of points (N,) and of curve observations
+            (M,); by default all take part.
     """
     at, scale = equations.observation, np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
     observations = equations.sights.observations
@@ -307,7 +306,7 @@ def equation_weights(
 
 
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> Linearised:
-    """The linear model of a calibration, its priors included."""
+    """The linear model of a calibration, with its priors."""
     keys = free_keys(estimate, problem.layout, problem.private)
     blank, columns = without_shared(problem, estimate, equations, weights, keys)
     rest = blank.beyond_private(columns)
@@ -331,28 +330,29 @@ def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations
 def linearise_within(
     problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, known: Information
 ) -> Linearised:
-    """Some equations in directions in which everything shared is known to one by all that there is.
+    """The linear model of some equations, in directions in which the information of everything is the unit matrix.
 
     Args:
-        known: of the shared numbers, by all equations and priors. `step` is 0: the whole is at its optimum.
+        known: information on the shared numbers, of all equations and priors. `step` is 0: the whole is at its optimum.
     """
     root, built = known_root(known), np.array([key.is_structure for key in known.keys], dtype=bool)
     blank, columns = without_shared(
         problem, estimate, equations, weights, [k for k in known.keys if not k.is_structure]
     )
     shared = blank.beyond_private(columns) @ root[~built]
-    if built.any():  # of a board's thousand corners, each of which moves two equations a view, no matrix is made
+    if built.any():  # no matrix is made for a board's thousand corners, each of which moves two equations a view
         moved = equations.built_along(estimate.structure, root[built]) * blank.weight[:, None]
         shared += blank.beyond_private(moved)
     return replace(blank, shared=shared, root=root, step=np.zeros(root.shape[1]))
 
 
 def known_root(shared: Information) -> Array:
-    """(K, P) from directions in which all but the structure is known to one, which follows, to the shared numbers.
+    """(K, P) maps directions in which the information on all but the structure is the unit matrix, with the structure
+    at its best value, to the shared numbers.
 
-    How far the targets were built from their drawings has a scatter of its own (see `robust.as_built`).
+    The offsets of targets from their drawings have a scatter of their own (see `robust.as_built`).
     """
-    determined = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
+    determined = 1e-11  # eigenvalue at unit diagonal above which a direction counts as determined
     size, matrix = len(shared.keys), shared.matrix
     rest = np.array([key.kind != "structure" for key in shared.keys])
     if rest.all():
@@ -367,7 +367,7 @@ def known_root(shared: Information) -> Array:
 def without_shared(
     problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, keys: Sequence[Key]
 ) -> tuple[Linearised, Array]:
-    """The model of private placements alone, and the columns (E, P) of shared numbers, in standard deviations."""
+    """The model with only private placements, and the columns (E, P) of shared numbers, in standard deviations."""
     used, weight = weights.used, weights.inverse_sigma
     score = np.where(used, weights.robust * weight * equations.residual, 0.0)
     private, count = _private_basis(equations, problem, weight, used)
@@ -378,7 +378,7 @@ def without_shared(
 
 
 def _private_basis(equations: Equations, problem: Problem, weight: Array, used: Mask) -> tuple[Array, int]:
-    """(E, 6) see `Linearised`, and how many numbers it stands for."""
+    """(E, 6) the private bases, see `Linearised`, and the number of unknowns that they stand for."""
     basis = np.zeros((len(equations), 6))
     numbers = equations.sights.numbers(placements=problem.private)
     if not len(numbers):
@@ -395,7 +395,7 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
 
 
 def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
+    """(E, P) px per unit of each key: by how much the equations move with the shared numbers."""
     columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
     cameras = equations.sights.cameras
     for name in cameras:
@@ -422,7 +422,7 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
 
 
 def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:
-    """What priors say of the shared numbers, as rows (K, P) and values (K,) in their sigmas."""
+    """The priors on the shared numbers as equations: rows (K, P) and values (K,) in their sigmas."""
     place = {key: column for column, key in enumerate(keys)}
     rows, values = [np.zeros((0, len(keys)))], [np.zeros(0)]
     for prior in problem.priors_at(estimate):

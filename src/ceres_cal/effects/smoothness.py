@@ -1,4 +1,4 @@
-"""How smooth a lens without a formula is: the likeliest sizes of effects that are numbers of the model."""
+"""Estimate how smooth a lens without a formula is: the likeliest sizes of effects that are numbers of the model."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ceres_cal.scene.lens.base import Roughness
 def likeliest_sizes(
     normal: Array, slope: Array, forms: Sequence[Array], sigmas: Array, least: Array, at_rest: float
 ) -> tuple[Array, Array, Array]:
-    """The standard deviations sigma of effects whose numbers c have the prior information sum F / sigma^2.
+    """The likeliest standard deviations sigma of effects whose numbers c have the prior information sum F / sigma^2.
 
-    The fixed point of MacKay (Neural Computation 4, 1992), sigma^2 = c^T F c / gamma, with gamma = rank F - tr(C F) /
-    sigma^2 the number of directions that the data determine: the maximum of the restricted likelihood. One more
-    direction of the least size counts along (an inverse gamma distribution beforehand).
+    It is the fixed point of MacKay (Neural Computation 4, 1992), sigma^2 = c^T F c / gamma, with gamma = rank F - tr(C
+    F) / sigma^2 the number of directions that the data determine: the maximum of the restricted likelihood. One
+    additional direction of the least size is counted (an inverse gamma prior).
 
     Args:
-        normal, slope: (Q, Q) and (Q,) what data say of the numbers, whose best is normal^-1 slope. forms: (Q, Q) F of
-            each. sigmas: (K,) to begin from. least: (K,) what data cannot talk a size below. at_rest: relative change
-            of a size that ends the search.
+        normal, slope: (Q, Q) and (Q,) normal equations of the data, with the best numbers normal^-1 slope. forms: (Q,
+            Q) F of each effect. sigmas: (K,) initial sizes. least: (K,) sizes of the additional direction, so that data
+            cannot make a size much smaller. at_rest: relative change of a size at which the iteration has converged.
 
     Returns:
         (K,) sizes, (Q,) likeliest numbers, (Q, Q) inverse of their covariance.
     """
-    one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
-    steps = 200  # of the search for sizes
+    one = 1.0  # number of additional directions of the least size, so that few data do not make a size zero
+    steps = 200  # iterations at most
     ranks = np.array([_rank(form) for form in forms])
     told = _by_sizes(normal, slope, forms, sigmas)
     for _ in range(steps):
@@ -48,11 +48,12 @@ def likeliest_sizes(
 def _by_sizes(
     normal: Array, slope: Array, forms: Sequence[Array], first: Array
 ) -> Callable[[Array], tuple[Array, Array, Array]]:
-    """Of sizes sigma (K,): the likeliest numbers c (Q,), and tr(C F) and c^T F c (K,) of each form.
+    """A function of sizes sigma (K,) that returns the likeliest numbers c (Q,), and tr(C F) and c^T F c (K,) of each
+    form.
 
-    The numbers of the largest form that is diagonal are turned to where what data say of them is diagonal, too. Then
-    another size takes the inverse of what is left alone, a Schur complement, not of everything; along directions in
-    which it is one at the `first` sizes, so that inverses are plain.
+    The numbers of the largest diagonal form are rotated so that the data's information on them is diagonal, too. Then
+    another size requires only the inverse of the remainder, a Schur complement. It is taken along directions in which
+    the remainder at the `first` sizes is the unit matrix, so that a plain inverse is accurate.
     """
     sizes = [int(np.count_nonzero(form)) if is_diagonal(form) else 0 for form in forms]
     largest = int(np.argmax(sizes))
@@ -93,11 +94,11 @@ def _rank(form: Array) -> int:
 def with_smoothness(
     problem: Problem, estimate: Estimate, reduced: ReducedInformation
 ) -> tuple[Problem, ReducedInformation, float]:
-    """The problem with its lenses as smooth as the data say, what it then says, and the largest squared step, in
-    variances, that a lens is then off its least cost.
+    """The problem with its lenses as smooth as the data say, its information, and the largest squared step, in
+    variances, from a lens to its least cost under that smoothness.
 
     Args:
-        estimate: where the problem was solved. reduced: what it says there.
+        estimate: the solution of the problem. reduced: its information there.
     """
     found, moving = {}, 0.0
     for name, camera in estimate.cameras.items():
@@ -128,7 +129,7 @@ def _sigmas(
     reduced: ReducedInformation,
 ) -> tuple[tuple[float, ...], float]:
     """The standard deviation of each form, px, and the squared step to the least cost under them, in variances."""
-    at_rest = 1e-3  # relative change of a standard deviation
+    at_rest = 1e-3  # relative change of a standard deviation at which the iteration has converged
     own = tuple(keys[quantity] for form in forms for quantity in form.names)
     every = [Information(tuple(keys[q] for q in form.names), form.matrix).over(own).matrix for form in forms]
     whole = reduced.shared.marginal(own).matrix

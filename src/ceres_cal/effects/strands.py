@@ -1,6 +1,6 @@
-"""Equations whose errors may go together, side by side: of one curve, or of one image axis at one target's points.
+"""Strands: equations whose errors may be correlated, of one curve, or of one image axis at one target's points.
 
-Some views are enough: what is sought are a few numbers (a length, a share, a variance) that hold for all of them.
+Some views are enough: only a few numbers (a length, a share, a variance) that hold for all strands are estimated.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from ceres_cal.effects.linearised import Linearised, equation_weights, linearise
 from ceres_cal.observations.sights import Sights, bounds_of
 from ceres_cal.problem import Equations, Estimate, Problem, ReducedInformation, Residuals, equations_of
 
-_MOST_ROWS = 1_500  # of a kind in a view
+_MOST_ROWS = 1_500  # rows of a kind in a view
 
 
 class Strand(Frozen):
-    """Equations whose errors may go together: of one curve, or of one image axis at one target's points.
+    """Equations whose errors may be correlated: of one curve, or of one image axis at one target's points.
 
     Attributes:
-        rows: (N,) of the sample. places: (N, 3) m, where they lie on the target.
+        rows: (N,) equations of the sample. places: (N, 3) m, their places on the target.
     """
 
     rows: Indices
@@ -31,12 +31,12 @@ class Strand(Frozen):
 
     @cached_property
     def shape(self) -> bytes:
-        """Equal where the places are."""
+        """A value that is equal for strands with equal places."""
         return self.places.tobytes()
 
 
 def strands_of(equations: Equations, owner: Indices, rows: Indices) -> Iterator[Strand]:
-    """The curves, and the image axes of points, of each owner (E,), a view or a sight, among some rows."""
+    """The strands of each owner (E,), a view or a sight, in some rows: its curves, and image axes of its points."""
     name = strand_names(equations, owner)[rows]
     order = np.lexsort((equations.feature[rows], name))  # what one point shows in several views is side by side
     ends = np.flatnonzero(np.diff(name[order], append=-1)) + 1
@@ -51,23 +51,23 @@ def strands_of(equations: Equations, owner: Indices, rows: Indices) -> Iterator[
 
 
 def strand_names(equations: Equations, owner: Indices) -> Indices:
-    """(E,) number of the strand of an owner (E,) that each equation is of."""
+    """(E,) number of the strand to which each equation belongs; owner: (E,) its view or sight."""
     axis = (equations.direction[:, 1] > 0.5).astype(np.int64)
     what = np.where(equations.is_curve, equations.feature + 2, axis)
     return np.asarray(owner * (what.max() + 1) + what)
 
 
 def go_over_groups(equations: Equations, group: Indices) -> bool:
-    """Whether some strand of a sight goes over several groups (E,)."""
+    """Whether a strand of some sight covers several groups (E,)."""
     names = strand_names(equations, equations.sight)
     return len(distinct(names * (int(group.max()) + 1) + group)) > len(distinct(names))
 
 
 def families_of(model: Linearised, group: Indices, chosen: Mask) -> list[StrandFamily]:
-    """The strands of curves or of points, within views and then, where some sight has several, over all of a sight.
+    """The strands of curves or of points: within views and, where some sight has several views, over each whole sight.
 
     Args:
-        group: (E,) of the views or placements that are compared with one another. chosen: (E,) which equations.
+        group: (E,) the views or placements that are compared with one another. chosen: (E,) which equations.
     """
     equations = model.equations
     families, rows = [], np.flatnonzero(chosen)
@@ -87,13 +87,13 @@ def _has_several_views(equations: Equations) -> bool:
 
 
 def _along(places: Array) -> Array:
-    """(3,) from the first place towards the farthest."""
+    """(3,) vector from the first place to the farthest."""
     away = places - places[0]
     return np.asarray(away[np.argmax(np.sum(away**2, axis=1))])
 
 
 def distances_of(places: Array, others: Array) -> Array:
-    """(N, M) m between places (N, 3) and others (M, 3)."""
+    """(N, M) distances in m between places (N, 3) and others (M, 3)."""
     squared = np.zeros((len(places), len(others)))
     for here, there in zip(places.T, others.T, strict=True):
         squared += (here[:, None] - there) ** 2
@@ -102,7 +102,7 @@ def distances_of(places: Array, others: Array) -> Array:
 
 def decay(distance: Array, length: float, smooth: bool) -> Array:
     """Correlation at distances: of a rough random function, or of a smooth one."""
-    # Beside one it is rounding; where squares underflow LAPACK's search for eigenvalues may not end.
+    # Less is rounding beside a correlation of 1; and where squares underflow, LAPACK's eigenvalue search may not end.
     no_correlation = 1e-30
     relative = distance / length
     correlation = np.exp(-0.5 * relative**2 if smooth else -relative)
@@ -111,7 +111,7 @@ def decay(distance: Array, length: float, smooth: bool) -> Array:
 
 
 def decays(distance: Array, places: Sequence[tuple[float, bool]]) -> Iterator[Array]:
-    """Correlation at distances, by lengths and smoothness, the longest first: half a length is a square."""
+    """Correlations at distances for lengths and smoothness, the longest first: half the length gives the square."""
     last: dict[bool, tuple[float, Array]] = {}
     for length, smooth in places:
         before, correlation = last.get(smooth, (0.0, distance))
@@ -126,15 +126,16 @@ def decays(distance: Array, places: Sequence[tuple[float, bool]]) -> Iterator[Ar
 
 
 class StrandFamily(Frozen):
-    """S strands side by side, of M rows each at most that are looked at.
+    """S strands side by side, with at most M rows each.
 
     Attributes:
-        lasting: whether they go over several views.
-        strands: with all their rows, shape by shape. filled: (S, M) which rows there are.
-        columns: (S, M, Z) what is in them: six of private placements, those of what is shared, the residual; 0 where
+        lasting: whether the strands cover several views.
+        strands: the strands with all their rows, shape by shape. filled: (S, M) which rows exist.
+        columns: (S, M, Z) their columns: six of private placements, those of shared numbers, the residual; 0 where
             there is no row.
-        distance: (D, M, M) m of each shape, infinite where a row is missing; bounds: (D + 1,) where its strands begin.
-        group: (S,) whose private placement it shows.
+        distance: (D, M, M) m for each shape, infinite where a row is missing. bounds: (D + 1,) where the strands of
+            each shape begin.
+        group: (S,) the view or placement of each strand.
     """
 
     lasting: bool
@@ -147,7 +148,7 @@ class StrandFamily(Frozen):
 
     @classmethod
     def of(cls, strands: Sequence[Strand], lasting: bool, columns: Array, group: Indices) -> StrandFamily:
-        """Of the strands of one kind; columns (E, Z) and group (E,) of all equations."""
+        """Make the family of the strands of one kind from columns (E, Z) and groups (E,) of all equations."""
         shapes: dict[bytes, int] = {}
         same = [shapes.setdefault(strand.shape, len(shapes)) for strand in strands]
         strands = [strands[number] for number in np.argsort(same, kind="stable")]
@@ -162,7 +163,7 @@ class StrandFamily(Frozen):
             places = strands[first].places[picked[first]]
             whole[: len(places), : len(places)] = distances_of(places, places)
             np.fill_diagonal(whole, 0.0)
-        # Rows first in memory: those of all strands of one shape are then multiplied as one matrix.
+        # Rows come first in memory, so that those of all strands of one shape are multiplied as one matrix.
         side_by_side = columns[rows.T]
         side_by_side[~filled.T] = 0.0
         return cls(lasting, strands, filled, np.swapaxes(side_by_side, 0, 1), distance, starts, group[rows[:, 0]])
@@ -174,24 +175,24 @@ class StrandFamily(Frozen):
 
     @cached_property
     def gap(self) -> float:
-        """Median distance to the nearest neighbour, m; 0 where no strand has two places."""
+        """Median distance (m) between nearest neighbours; 0 where no strand has two places."""
         apart = np.where(self.distance > 0.0, self.distance, np.inf).min(axis=2)
         apart = apart[np.isfinite(apart)]
         return median(apart) if len(apart) else 0.0
 
     @cached_property
     def longest(self) -> float:
-        """Of all its distances, m."""
+        """The longest of all distances, m."""
         return float(np.max(self.distance, where=np.isfinite(self.distance), initial=0.0))
 
     @cached_property
     def products(self) -> Array:
-        """(Z, Z) of the columns over all rows."""
+        """(Z, Z) products of the columns, summed over all rows."""
         flat = np.swapaxes(self.columns, 0, 1).reshape(-1, self.columns.shape[2])
         return np.asarray(flat.T @ flat)
 
     def applied(self, matrices: Array) -> Array:
-        """(S, M, Z) the columns multiplied by matrices (D, M, M) of each shape."""
+        """(S, M, Z) the columns multiplied by the matrix (D, M, M) of each shape."""
         if len(matrices) == len(self.columns):
             return np.asarray(matrices @ self.columns)
         rows_first = np.swapaxes(self.columns, 0, 1)
@@ -202,7 +203,7 @@ class StrandFamily(Frozen):
         return np.swapaxes(product, 0, 1)
 
     def squared(self, chosen: slice) -> Array:
-        """(D, M, M) sum of x x^T over the strands of each shape, x (M, Q) some of the columns."""
+        """(D, M, M) sum of x x^T over the strands of each shape, with x (M, Q) some of the columns."""
         columns = self.columns[..., chosen]
         if len(self.distance) == len(columns):
             return np.asarray(columns @ np.swapaxes(columns, 1, 2))
@@ -212,24 +213,24 @@ class StrandFamily(Frozen):
 
 @lru_cache(maxsize=256)
 def _near_and_far(count: int) -> Indices:
-    """Rows of a strand: all of few; else some next to one another in its middle, and some over all of it."""
-    each = 30  # rows of a strand that are looked at: next to one another, and over all of it
+    """Chosen rows of a strand: all of a short one; else some neighbours in its middle, and some over all of it."""
+    each = 30  # rows of either sort
     if count <= each + each:
         return np.arange(count)
     return distinct(np.append((count - each) // 2 + np.arange(each), evenly(count, each)))
 
 
-# ---- the views that are asked ---------------------------------------------------------------------------------------
+# ---- the sampled views ----------------------------------------------------------------------------------------------
 
 
 def sampled(
     problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation, most_views: int
 ) -> Linearised | None:
-    """The equations of at most so many views of every camera; None where there are no shared numbers.
+    """The linear model of at most `most_views` views of every camera; None where there are no shared numbers.
 
     Args:
-        problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
-            problem says there.
+        problem: as it was solved, at the estimated noise. there: residuals at the estimate. reduced: its information at
+            the estimate.
     """
     sights = _shown(problem.sights, there)
     if not len(reduced.shared.matrix) or not len(sights):
@@ -240,7 +241,7 @@ def sampled(
 
 
 def _shown(sights: Sights, there: Residuals) -> Sights:
-    """Without the rows that have no residual: a lens in the middle of its valley may not reach as far."""
+    """The sights without rows that have no residual: the lens in the middle of its valley may not reach them."""
     points, curves = (np.isfinite(lengths) for lengths in there.lengths)
     if points[sights.point_rows].all() and curves[sights.curve_rows].all():
         return sights
@@ -248,7 +249,7 @@ def _shown(sights: Sights, there: Residuals) -> Sights:
 
 
 def _some(sights: Sights, most_views: int) -> Sights:
-    """Of each camera at most so many views, evenly, and of each of them some rows."""
+    """At most `most_views` views of each camera, evenly, and some rows of each of them."""
     observations = sights.observations
     chosen, shown = np.zeros((2, len(observations.views)), dtype=bool)
     shown[observations.points.view[sights.point_rows]] = True
@@ -268,7 +269,7 @@ def _some(sights: Sights, most_views: int) -> Sights:
 
 
 def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
-    """(N,) rows of the chosen views, of each view at most _MOST_ROWS."""
+    """(N,) mask of rows of the chosen views, at most _MOST_ROWS of each view."""
     rows = chosen[view]
     for number in np.flatnonzero(np.bincount(view[rows], minlength=len(chosen)) > _MOST_ROWS):
         own = np.flatnonzero(view == number)
@@ -278,28 +279,28 @@ def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
 
 
 def views_or_placements(equations: Equations) -> Indices:
-    """(E,) number of the view, or of the placement that several views show."""
+    """(E,) number of the view, or of the placement where several views show it."""
     world = np.array([key.placement is None for key in equations.sights.keys])[equations.sight]
     numbers = np.where(world, equations.view, equations.view.max() + 1 + equations.sight)
     return np.asarray((np.cumsum(np.bincount(numbers) > 0) - 1)[numbers])
 
 
-# ---- is there any correlation to look for? ---------------------------------------------------------------------------
+# ---- is there any correlation? --------------------------------------------------------------------------------------
 
-# Score tests at three lengths, which cost no likelihood. That of a share a of nothing is r' K r with K = exp(-d / l) -
-# 1, against its expectation -tr(K H) and its variance under independent errors, of which the fit took up the part H =
-# U U'. Summed over the strands of one shape first, r r' and H serve all lengths.
+# Score tests at three lengths need no likelihood. The score of a share a at a = 0 is r' K r with K = exp(-d / l) - 1.
+# It is compared with its expectation -tr(K H) and its variance under independent errors, of which the fit absorbed the
+# part H = U U'. Summed over the strands of one shape first, r r' and H serve all lengths.
 
 ASIDE = 20.0
-"""Times the longest strand: the length of what moves it as a whole."""
-# The likelihood is asked from so many standard deviations of a score test on (one in five of white noise), if the
-# correlation that is likely by it would widen the variance of what is shared by so much.
+"""Correlation length, in lengths of the longest strand, that stands for errors that move a strand as a whole."""
+# The likelihood is computed where a score test exceeds LOUD standard deviations (one in five for white noise), and the
+# correlation that it suggests would widen the variance of the shared numbers by more than the share _MATTERS.
 LOUD, _MATTERS = 0.85, 0.08
 
 
 def is_loud(family: StrandFamily) -> bool:
-    """Whether neighbours, nearby rows or whole strands agree more than they do in one of five sets of white noise."""
-    no_noise = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
+    """Whether errors of neighbours, nearby rows or whole strands agree more than in one of five sets of white noise."""
+    no_noise = 1e-6  # mean square, in squared standard deviations, below which residuals are only rounding
     gap, longest, sums = family.gap, family.longest, np.diagonal(family.products)
     noise = sums[-1] / max(np.count_nonzero(family.filled) - np.sum(sums[:-1]), 1.0)
     if gap == 0.0 or noise < no_noise:
@@ -320,7 +321,7 @@ def is_loud(family: StrandFamily) -> bool:
 
 
 def _variance(family: StrandFamily, together: Array, squares: float) -> float:
-    """Of the score at the matrices (D, M, M), whose squared entries add up to so much over all strands."""
+    """Variance of the score with matrices (D, M, M), whose squared entries sum to `squares` over all strands."""
     taken, along = family.columns[..., :-1], family.applied(together)[..., :-1]
     inner = np.swapaxes(taken, 1, 2) @ along
     return float(2.0 * (squares - 2.0 * np.sum(along**2) + np.sum(inner**2)))

@@ -1,6 +1,6 @@
-"""The table of effects: every module of this folder adds its rows, in its EFFECTS.
+"""The table of effects: every module of this package adds rows to it, by its EFFECTS.
 
-And what all of them that are found say together.
+Also the joint result of all effects that are found.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ceres_cal.problem import Key, free_keys
 
 
 def rows() -> dict[str, Effect]:
-    """The effects of every module of the folder, by kind."""
+    """The effects of all modules of this package, by kind."""
     modules = (import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__))
     return {effect.kind: effect for module in modules for effect in module.EFFECTS}
 
@@ -28,24 +28,24 @@ EFFECTS = rows()
 
 
 def estimated(observations: Observations) -> list[Effect]:
-    """Those that `calibrate` solves for in some observations, and widens by."""
+    """Effects whose sizes `calibrate` estimates for some observations: it solves for them or widens by them."""
     return [effect for effect in EFFECTS.values() if effect.prior is not None and effect.concerns(observations)]
 
 
 def columns_of_all(case: Case) -> list[EffectColumns]:
-    """The columns of every effect."""
+    """The columns of all effects."""
     return [columns for effect in EFFECTS.values() for columns in effect.columns(case)]
 
 
-# ---- all of them at once --------------------------------------------------------------------------------------------
+# ---- the joint step -------------------------------------------------------------------------------------------------
 
 
-# One step of least squares with everything that the residuals speak for: what a calibration would then be. Causes that
-# look alike share what they explain by what is expected of them, and what one moves another may take back.
+# One step of least squares with all effects that the residuals support shows what a calibration with them would be.
+# Causes that look alike share what they explain according to their priors, and what one moves another may undo.
 
 
 class JointStep(Frozen):
-    """What is wrong with the model of a case, all at once.
+    """What is wrong with the model of a case, all together.
 
     Attributes:
         causes: groups of effects, with their likeliest amounts (Q,).
@@ -56,13 +56,13 @@ class JointStep(Frozen):
 
     @cached_property
     def moves(self) -> dict[Key, float]:
-        """By how much the free numbers move."""
+        """By how much each free number moves."""
         keys = free_keys(self.case.estimate, self.case.problem.layout, self.case.problem.private)
         steps = [self.case.model.taken_by(score.columns) @ amount for score, amount in self.causes]
         return dict(zip(keys, np.sum(steps, axis=0).tolist(), strict=True)) if steps else {}
 
     def displaced(self, camera: str, pixels: Array) -> Array:
-        """(N, 2) px by which a camera displaces besides what it shows at pixels (N, 2)."""
+        """(N, 2) px displacements of a camera at pixels (N, 2), beside those of its own model."""
         total = np.zeros((len(pixels), 2))
         for score, amount in self.causes:
             displacement = EFFECTS[score.effect.kind].displacement
@@ -73,12 +73,12 @@ class JointStep(Frozen):
 
 
 def joint_step(case: Case, selection: Selection, solved: Collection[tuple[str, str, str | None]]) -> JointStep:
-    """The step with the chosen effects, and in place of one whose amount is not to be expected with what it may be
-    instead. Where nothing else is known to look like it, it moves nothing: what it shows stays wrong all the same.
+    """The step with the chosen effects. An effect with an implausible amount is replaced by its rivals; if it has none,
+    it moves nothing, but what it shows is still wrong.
 
     Args:
-        solved: effects by kind, subject and frame that are in the calibration already: what more is asked of them is
-            free, and no fault.
+        solved: effects, by kind, subject and frame, that the calibration has solved for: further amounts of them are
+            free and no fault.
     """
     every = list(selection.chosen)
     unlike = [score for score in every if EFFECTS[score.effect.kind].is_implausible(case, score)]

@@ -1,5 +1,5 @@
-"""A camera that was moved, and where its pixels lie: skew, aspect, principal point and phi, and points that are all
-shifted.
+"""Effects of a camera: that it moved, and errors of its pixel geometry: skew, aspect, principal point, phi, coma, and
+points that are shifted against curves.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ceres_cal.problem import intrinsic_names, pixel_slopes
 
 
 def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
-    """Each station turned about the camera's axes, shifted in the world: from some frame on, or in one frame alone."""
+    """A turn about the camera's axes and a shift in the world of each station: from some frame on, or in one frame."""
     equations = case.equations
     frames = [(view.station, view.frame) for view in case.problem.observations.views]
     known = list(dict.fromkeys(frames))
@@ -27,11 +27,11 @@ def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
     several = np.array([bool(np.any(frame[start:stop] != frame[start])) for start, stop in bounds])
     tied = np.array([key.placement not in case.problem.private for key in equations.sights.keys])
     of_station = np.array([key.station for key in equations.sights.keys])
-    columns = cache(partial(motion_columns, case))  # which most cases need for no station
+    columns = cache(partial(motion_columns, case))  # most cases need them for no station
     for station in case.problem.observations.stations:
         present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
         names, last = tuple(known[number][1] for number in present), len(present) - 1
-        # In the first or last frame alone is the same as from there on.
+        # A motion in the first or last frame alone is the same as one from there on.
         tested = last > 0 if onwards else (group > 0) & (group < last)
         group = np.where(tested, group, -1)
         if np.any(group >= 0):
@@ -65,7 +65,9 @@ def _of_move(evidence: Evidence) -> Words:
 
 
 def motion_columns(case: Case) -> Array:
-    """(E, 6) px per radian about the camera's axes through its own position, and per metre along the world's."""
+    """(E, 6) px per radian about the camera's axes through its own position, and px per metre along the world's
+    axes.
+    """
     equations = case.equations
     columns = np.empty((len(equations), 6))
     for number, key in enumerate(equations.sights.keys):
@@ -77,14 +79,14 @@ def motion_columns(case: Case) -> Array:
 
 
 def _length(vector: Array, sd: Array) -> tuple[float, float]:
-    """Length of a vector, and its standard deviation by that of its parts."""
+    """Length of a vector, and its standard deviation from those of its components."""
     length = float(np.linalg.norm(vector))
     known = np.isfinite(sd)
     return length, float(np.linalg.norm(vector[known] * sd[known])) / max(length, 1e-300)
 
 
 def _leaning(case: Case, camera: str, pixels: Array) -> Array | None:
-    """The axes of the pixels are not perpendicular: x grows with y."""
+    """A skew: the axes of the pixels are not perpendicular, and x grows with y."""
     one = case.estimate.cameras[camera]
     if intrinsic_names(one.lens).index("skew") in case.problem.layout.free[camera]:
         return None
@@ -103,7 +105,7 @@ def _of_skew(evidence: Evidence) -> Words:
 
 
 def _held(places: list[int], case: Case, camera: str, pixels: Array) -> Array | None:
-    """Numbers of the pixels that are held, by their places in the intrinsics vector."""
+    """Held intrinsics of the pixels, by their positions in the intrinsics vector."""
     if set(places) & set(case.problem.layout.free[camera].tolist()):
         return None
     one = case.estimate.cameras[camera].at(Pose.identity())
@@ -140,7 +142,7 @@ _HALF = "this is the half pixel between counting from the centre and from the co
 
 
 def _shifted(case: Case) -> Iterator[EffectColumns]:
-    """A camera's points lie aside of its curves: two detectors that count pixels from different places."""
+    """A shift of a camera's points against its curves: two detectors that count pixels from different origins."""
     is_curve, camera = case.equations.is_curve, case.camera
     both = np.isin(camera, camera[is_curve & case.model.used])
     group = np.where(~is_curve & both, camera, -1)
@@ -148,7 +150,7 @@ def _shifted(case: Case) -> Iterator[EffectColumns]:
 
 
 def _of_shift(evidence: Evidence) -> Words:
-    # How near to half a pixel a shift must be to be called that: in standard deviations, and px.
+    # How near to half a pixel a shift must be to be reported as that: in standard deviations, and px.
     half_sd, half_px = 3.0, 0.1
     px, sd = evidence.score.amount, evidence.score.sd
     half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(half_sd * sd, half_px)))
@@ -161,14 +163,14 @@ def _of_shift(evidence: Evidence) -> Words:
 
 
 def _coma_px(case: Case, camera: str) -> float:
-    """Standard deviation that was stated of it; 0 of none."""
+    """The stated standard deviation (px) of a camera's coma; 0 if none is stated."""
     stated = case.problem.observations.priors
     return max((prior.sigma[0] for prior in stated if prior.is_coma and prior.name == camera), default=0.0)
 
 
 def _drawn_out(case: Case, camera: str, pixels: Array) -> Array | None:
-    """What coma may draw outwards, where a picture's lines are lopsided: each moves along its normal alone, so together
-    they look like another lens, and no residual tells.
+    """An outward displacement by coma, where lines in a picture are lopsided. Each line moves only along its normal, so
+    together they look like another lens, and no residual shows it.
     """
     if not _coma_px(case, camera):
         return None

@@ -1,5 +1,5 @@
-"""The lens: a polynomial that is too short, parts that are not centred, a thin prism before it; or another one from
-some frame on: knocked or zoomed, or the pictures of another camera.
+"""Effects of a lens: a polynomial that is too short, decentred parts, a thin prism before it; or another lens from some
+frame on: knocked or zoomed, or pictures of another camera.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, camer
 from ceres_cal.problem import OF_PIXELS, USUAL_DECENTRING, unit_px
 from ceres_cal.scene import LENSES, Camera, Lens
 
-# Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few
-# observations.
+# Numbers of half waves over the observed radius, for a lens without a formula: it follows longer waves, and shorter
+# ones have few observations each.
 _WAVES = range(5, 25)
 
 
 def _along_radius(case: Case, camera: str, pixels: Array) -> Array | None:
-    """Residuals follow the radius: the polynomial is too short."""
-    radial_basis = 3  # powers of the radius past the lens's: enough for any trend that one more power mends
+    """Residuals along the radius: the polynomial is too short."""
+    radial_basis = 3  # powers beyond the lens's own: enough for any trend that one more power corrects
     if case.estimate.cameras[camera].lens.roughness:
         return _waves(case, camera, pixels)
     return _growing(case.estimate.cameras[camera], pixels, _missing_powers(case, camera)[:radial_basis])
@@ -51,7 +51,7 @@ def _of_radius(evidence: Evidence) -> Words:
 
 
 def _longer(case: Case, camera: str, power: int) -> str:
-    """How to calibrate with one more power."""
+    """The advice on how to calibrate with one more power."""
     lens = case.estimate.cameras[camera].lens
     held = [key for key, order in zip(lens.names, lens.orders, strict=True) if order == power]
     held = [key for key in held if key not in _across(lens)]
@@ -74,28 +74,26 @@ def _missing_powers(case: Case, camera: str) -> list[int]:
 
 
 def _across(lens: Lens) -> set[str]:
-    """Names of coefficients that displace across the radius, which it has or may have."""
+    """Names of coefficients, which the lens has or may have, that displace across the radius."""
     return {*lens.decentring, *(name for term in ("tangential", "prism") for name in lens.more_terms.get(term, ()))}
 
 
 def _outward(camera: Camera, pixels: Array) -> tuple[Array, Array]:
-    """(N,) radius of pixels (N, 2), in half image diagonals, and (N, 2) px of a displacement of one away from the
-    centre.
-    """
+    """(N,) radius of pixels (N, 2), in half image diagonals, and (N, 2) px of a unit displacement outwards."""
     offsets = half_diagonals(camera, pixels)
     radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     return radius, np.asarray(offsets * (1.0, camera.aspect) / radius[:, None])
 
 
 def _growing(camera: Camera, pixels: Array, powers: Sequence[int]) -> Array:
-    """(N, 2, powers) px per unit of coefficients more in the lens's polynomial, scaled to be of order one."""
+    """(N, 2, powers) px per unit of additional coefficients of the lens's polynomial, scaled to be of order one."""
     offsets, outward = camera.offsets(pixels), _outward(camera, pixels)[1]
     growth = camera.lens.radial_change(offsets, camera.phi, unit_px(camera), np.array(powers))
     return np.asarray(outward[:, :, None] * growth[:, None])
 
 
 def _waves(case: Case, camera: str, pixels: Array) -> Array:
-    """(N, 2, waves) px per px of displacements along the radius that go up and down as far as was observed."""
+    """(N, 2, waves) px per px of displacements along the radius that oscillate over the observed radius."""
     one, own = case.estimate.cameras[camera], case.camera == case.cameras.index(camera)
     radius, outward = _outward(one, pixels)
     share = radius / np.max(_outward(one, case.equations.pixel[own])[0], initial=1e-12)
@@ -129,12 +127,12 @@ def _of_decentring(evidence: Evidence) -> Words:
 
 
 def _tangential(lens: Lens) -> tuple[str, ...]:
-    """Names of Brown's decentring coefficients, which it has or may have."""
+    """Names of Brown's decentring coefficients, which the lens has or may have."""
     return lens.tangential or lens.more_terms.get("tangential", ())
 
 
 def _one_way(case: Case, camera: str, pixels: Array) -> Array | None:
-    """OpenCV's thin prism, where the lens does not solve for it: all is displaced one way, by r^2 and r^4."""
+    """OpenCV's thin prism, where the lens does not solve for it: a displacement in one direction, by r^2 and r^4."""
     one = case.estimate.cameras[camera]
     parts = one.lens.more_terms.get("prism", ())
     if parts and set(parts) <= case.free_coefficients(camera):
@@ -144,8 +142,8 @@ def _one_way(case: Case, camera: str, pixels: Array) -> Array | None:
 
 
 def _usual_px(case: Case, camera: str) -> float:
-    """What is usual of a lens that is not centred, px in the picture's corners; of a prism no more is known. Without it
-    a prism of 4 ± 2 px moved the principal point of a rig, whose lens leaves 0.006 px, by 42 standard deviations.
+    """Usual size of decentring, px in the picture's corners; no more is known of a prism. Without it, a prism of 4 ± 2
+    px moved the principal point of a rig, whose lens leaves 0.006 px, by 42 standard deviations.
     """
     one = case.estimate.cameras[camera]
     return USUAL_DECENTRING * unit_px(one) ** 2 / one.phi
@@ -167,11 +165,11 @@ _PLACES = [OF_PIXELS.index(name) for name in _NUMBERS]
 
 
 def lens_changes(case: Case) -> Iterator[EffectColumns]:
-    """phi and the principal point of a camera are others in the frames after one, by boards that are held up."""
+    """A change of phi and the principal point of a camera after a frame, from boards that are held up."""
     frames = [(view.camera, view.frame) for view in case.problem.observations.views]
     known = list(dict.fromkeys(frames))
     frame = numbers_of(frames, known)[case.equations.view]
-    # Over a field a knock turns the camera, too, and a turn looks like another principal point.
+    # Over a field, a knock turns the camera as well, and a turn looks like another principal point.
     private = np.array([key.placement in case.problem.private for key in case.equations.sights.keys], dtype=bool)
     held_up = private[case.equations.sight]
     for number, name in enumerate(case.cameras):
@@ -194,12 +192,13 @@ def _of_change(evidence: Evidence) -> Words:
 
 
 def _where_likely(case: Case, every: EffectColumns) -> Iterator[EffectColumns]:
-    """The likeliest frame of all, where the change is beyond what single frames say of the lens otherwise.
+    """The likeliest frame of all, where the change exceeds what single frames say of the lens otherwise.
 
-    Errors that go together within a frame, as over a board that is not as drawn, shift the lens of each frame by more
-    than the noise does. So the change is judged by the scatter of frames about it, Fisher's F, and not by the noise.
+    Errors that are correlated within a frame, as over a board that differs from its drawing, shift the lens of each
+    frame by more than the noise does. So the change is compared with the scatter of frames about it (Fisher's F), not
+    with the noise.
     """
-    rate = 0.001  # of a false alarm over all frames: of nine real sets of boards none has one
+    rate = 0.001  # probability of a false alarm over all frames: of nine real sets of boards none has one
     changes = score_all(case.model, [EffectSums.of(case.model, every)], by_chance=False)
     if not changes:
         return

@@ -1,4 +1,4 @@
-"""The target as built (a line, an arc or a point aside, a board that is bent or stretched), and the floor: bowed as a
+"""Effects of targets as built (a displaced line, arc or point, a bent or stretched board), and of the floor: bowed as a
 whole, higher at one place than around it, or with a field that is painted out of square.
 """
 
@@ -18,19 +18,19 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.structure import STRETCH, WARP, dimension_slopes, dimensions_of
 from ceres_cal.scene.targets import Arc, Segment, still
 
-# Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
-# Nothing changes from half to double.
+# Observations from which on a curve is tested: three numbers describe an arc, and as many equations must be able to
+# contradict them. Halving or doubling changes nothing.
 _FEWEST_ON_CURVE = 8
-# Observations that say whether a point lies aside: one could be an outlier that was just not taken out. Nothing
-# changes from half to double.
+# Observations from which on a point is tested: a single one could be an outlier that was just not rejected. Halving or
+# doubling changes nothing.
 _FEWEST_OF_POINT = 2
 
 
 def _offsets(places: slice, case: Case, *, curves: bool = False) -> Iterator[EffectColumns]:
-    """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
+    """Offsets of structure numbers that no tolerance solves for, where enough of their equations are used.
 
     Args:
-        places: of the numbers, as in `Equations.built`. curves: whether of curves, or of points.
+        places: the columns of `Equations.built` that belong to the numbers. curves: whether curves or points are meant.
     """
     fewest = _FEWEST_ON_CURVE if curves else 2 * _FEWEST_OF_POINT
     equations, structure = case.equations, case.whole_structure
@@ -43,14 +43,14 @@ def _offsets(places: slice, case: Case, *, curves: bool = False) -> Iterator[Eff
 
 
 def _with_enough(group: Indices, used: Mask, fewest: int) -> Indices:
-    """The groups (E,), -1 for none, without those of which fewer equations are used."""
+    """The groups (E,), -1 for none, without those of which fewer than `fewest` equations are used."""
     counts = np.bincount(group[(group >= 0) & used], minlength=int(group.max(initial=-1)) + 2)
-    return np.where(counts[group] >= fewest, group, -1)  # -1 finds the last count, which is 0
+    return np.where(counts[group] >= fewest, group, -1)  # index -1 is the last count, which is 0
 
 
 def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
-    """One finding for a target of which several features lie aside."""
-    # Features aside of one target from which on it is the target. Two may be lines that somebody painted anew.
+    """Combine the findings of a target with several displaced features into one."""
+    # Displaced features of one target from which on the target is reported. Two may be lines that were repainted.
     several = 3
     for target in dict.fromkeys(one.subject.partition("/")[0] for one in findings):
         own = [one for one in findings if one.subject.partition("/")[0] == target]
@@ -109,10 +109,10 @@ def _of_point(evidence: Evidence) -> Words:
 
 
 def _lengths(case: Case) -> Iterator[EffectColumns]:
-    """A length that a target is drawn by is another one: many of its lines and points lie elsewhere, in proportion.
+    """Another value of a target's dimension: many of its lines and points are displaced, in proportion.
 
-    The size of a board that one station at a time sees is no other than its distance, and without a field that of all
-    boards of a rig is no other than that of its baselines: neither is asked.
+    The size of a board that only one station at a time sees cannot be distinguished from its distance, and without a
+    field that of all boards of a rig cannot be distinguished from that of its baselines. Neither is tested.
     """
     structure, problem = case.whole_structure, case.problem
     views, targets = problem.observations.shown_views, problem.observations.targets
@@ -136,7 +136,7 @@ def _of_length(evidence: Evidence) -> Words:
 
 
 def _of_board(evidence: Evidence) -> Words:
-    # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
+    # Standard deviations from which on a twist or a wave of a board is reported beside its bows.
     clear = 2.0
     name = evidence.score.subject
     mm, sd = evidence.in_mm
@@ -155,7 +155,7 @@ def _of_board(evidence: Evidence) -> Words:
 
 
 def _stretched(case: Case) -> Iterator[EffectColumns]:
-    """A board is longer along x and as much shorter along y: both alike is what no view shows."""
+    """A board that is longer along x and as much shorter along y; a stretch alike along both is visible in no view."""
     for both in _offsets(_STRETCHES, case):
         yield replace(both, columns=both.columns @ np.array([[0.5], [-0.5]]))
 
@@ -171,7 +171,7 @@ def _of_stretch(evidence: Evidence) -> Words:
 
 
 def _bowed(case: Case) -> Iterator[EffectColumns]:
-    """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
+    """A floor that is not plane: it falls or rises towards its edges, or is twisted."""
     target, names, (x, y) = _over_targets(case)
     heights = np.column_stack([x * x, y * y, x * y])
     yield EffectColumns(_moved(case, 2)[:, None] * heights, target, names)
@@ -189,7 +189,7 @@ def _of_bow(evidence: Evidence) -> Words:
 
 
 def _sheared(case: Case) -> Iterator[EffectColumns]:
-    """What runs along x is not at right angles to what runs along y."""
+    """A field whose lines along x are not at right angles to those along y."""
     target, names, (x, y) = _over_targets(case)
     yield EffectColumns((_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
 
@@ -206,11 +206,11 @@ def _lower(mm: float, sd: float) -> str:
 
 
 def _uneven(case: Case) -> Iterator[EffectColumns]:
-    """The floor is higher or lower at one place."""
-    # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted.
-    # Nothing changes from half to double.
+    """A floor that is higher or lower at one place."""
+    # Equations from which on the height of a place is tested: one height, and as many as contradict an outlier.
+    # Halving or doubling changes nothing.
     fewest_at_place = 8
-    cell_m = 1.0  # of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
+    cell_m = 1.0  # size of such a place: a tile, a cable under the carpet; few lines cross a place of half this size
     target, names = _target_of(case)
     cell = np.floor(case.equations.place[:, :2] / cell_m + 0.5).astype(np.int64)
     span = 2 * int(np.abs(cell).max(initial=0)) + 1
@@ -234,7 +234,7 @@ def _of_place(evidence: Evidence) -> Words:
 
 
 def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
-    """(E,) which target that is part of the world each equation shows, -1 for a movable one; and their names."""
+    """(E,) number of the immovable target that each equation shows, -1 for a movable one; and the targets' names."""
     observations = case.problem.observations
     names = tuple(still(observations.targets))
     number = {name: place for place, name in enumerate(names)}
@@ -243,14 +243,14 @@ def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
 
 
 def _moved(case: Case, axis: int) -> Array:
-    """(E,) px per metre that the place of each equation is moved along an axis of the world."""
+    """(E,) px per metre by which the place of each equation is moved along an axis of the world."""
     along = case.equations.poses[case.equations.sight, :, axis]
     return np.asarray(np.sum(case.equations.motion * along, axis=1))
 
 
 def _over_targets(case: Case) -> tuple[Indices, tuple[str, ...], Array]:
-    """What `_target_of` says, and (2, E) places from the middle of what was observed of each target over half of its
-    longer side.
+    """The result of `_target_of`, and (2, E) places relative to the middle of the observed part of each target, in
+    units of half of its longer side.
     """
     target, names = _target_of(case)
     over = np.zeros((2, len(target)))
@@ -262,7 +262,7 @@ def _over_targets(case: Case) -> tuple[Indices, tuple[str, ...], Array]:
 
 
 def _extent(places: Array) -> tuple[Array, float]:
-    """Middle (2,) and half of the longer side of the box around places (N, 3), m."""
+    """Middle (2,) m and half of the longer side, m, of the box around places (N, 3)."""
     if not len(places):
         return np.zeros(2), 1.0
     low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
@@ -274,8 +274,8 @@ def _has_floor(observations: Observations) -> bool:
 
 
 def _has_few_boards(observations: Observations) -> bool:
-    """Whether boards are seen that may be stretched without showing it: from 7 views on 0.2 % shows."""
-    most_views = 14  # twice as many, whatever the noise: of 20 views it took a fifth of the time
+    """Whether there are boards whose stretch may be invisible in so few views: from 7 views on, 0.2 % is visible."""
+    most_views = 14  # twice as many, for any noise: with 20 views it took a fifth of the time
     boards = sum(observations.targets[view.target].bows for view in observations.shown_views)
     return 0 < boards <= most_views
 
