@@ -1,4 +1,4 @@
-"""What observations are made of: views, priors, and columns of points and curves."""
+"""Parts of observations: views, priors, and columns of points and curves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Ma
 
 
 class View(Frozen, eq=True):
-    """What one frame shows of one target. `placement` None: the target lies in the world, as a field does."""
+    """What one frame shows of one target. `placement` is None for a target in the world, such as a field."""
 
     frame: str
     camera: str
@@ -30,13 +30,14 @@ PRIOR_OWNERS = ("camera", "station", "target")
 
 
 class Prior(Frozen, eq=True):
-    """What is known beforehand: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
+    """Prior knowledge: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
 
-    Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
-    coefficients by name in the units of the files. Of a target: its dimensions (m), which are solved for then; a sigma
-    that is infinite says that the value is only where to start from. And CURVE.offset_m, of a curve that lies
-    beside its drawing: about 0, it is solved for, too. Of a camera also COMA, about 0: how far its lens's coma may draw
-    everything outwards, by the square of the radius, px at half a diagonal of the image.
+    Quantities of a station are height_m and position_m (m). Those of a camera are phi, principal_point (px), aspect,
+    and the lens's coefficients by name in the units of the files. Those of a target are its dimensions (m), which are
+    then estimated; an infinite sigma says that the value is only an initial estimate. CURVE.offset_m of a target is the
+    offset of a misplaced curve from its drawing; the value is 0, and it is estimated, too. COMA of a camera is how far
+    its lens's coma displaces all observations outwards, by the square of the radius, px at half a diagonal of the
+    image; the value is 0.
 
     Raises:
         InputError: on construction: an unknown owner, numbers that are not finite, a sigma that is not above 0.
@@ -49,7 +50,7 @@ class Prior(Frozen, eq=True):
     value: tuple[float, ...]
     sigma: tuple[float, ...]
     gives_way: bool = False
-    """Whether it counts less, the farther off it is: files have none that does."""
+    """Whether it counts less the farther off it is; no prior in a file does."""
 
     def __post_init__(self) -> None:
         take_types(self)
@@ -69,27 +70,27 @@ class Prior(Frozen, eq=True):
 
     @property
     def is_open(self) -> bool:
-        """Whether a target's dimension is not known at all."""
+        """Whether nothing is known of a target's dimension."""
         return self.owner == "target" and self.sigma == (np.inf,)
 
     @property
     def is_coma(self) -> bool:
-        """Whether it is about what coma does to a camera's picture."""
+        """Whether it is on the displacement by a camera's coma."""
         return self.owner == "camera" and self.quantity == COMA
 
     @property
     def dimension(self) -> str:
-        """The "target/dimension" that it is about; nothing where it is about something else."""
+        """The "target/dimension" that the prior is on; "" for other priors."""
         return f"{self.name}/{self.quantity}" if self.owner == "target" and not self.curve else ""
 
     @property
     def curve(self) -> str:
-        """The target's curve whose offset it is about; nothing where it is about something else."""
+        """The target's curve on whose offset the prior is; "" for other priors."""
         return self.quantity.removesuffix(_OFFSET) if self.owner == "target" and self.quantity.endswith(_OFFSET) else ""
 
     @classmethod
     def of_offset(cls, target: str, curve: str, sigma_m: float) -> Prior:
-        """What is known of a curve that lies beside its drawing."""
+        """Make the prior on the offset of a curve from its drawing."""
         return cls("target", target, f"{curve}{_OFFSET}", (0.0,), (sigma_m,))
 
 
@@ -103,7 +104,7 @@ TYPES: dict[str, type[np.generic]] = {
 
 
 class Columns(Rows):
-    """Columns of observations, read-only: index of the view, index into the target's names, pixel, its sigma."""
+    """Columns of observations, read-only: number of the view, number among the target's names, pixel, its sigma."""
 
     view: Indices32
     feature: Indices32
@@ -112,9 +113,10 @@ class Columns(Rows):
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
-            if isinstance(values, np.memmap) or _is_kept(values, TYPES[name]):  # which stays in its file, or as it is
+            # stays in its file, or is suitable already
+            if isinstance(values, np.memmap) or _is_kept(values, TYPES[name]):
                 continue
-            column = np.array(values, dtype=TYPES[name], order="C")  # the compiled kernels take no other order
+            column = np.array(values, dtype=TYPES[name], order="C")  # the compiled kernels require this order
             column.setflags(write=False)
             object.__setattr__(self, name, column)
 
@@ -123,7 +125,7 @@ class Columns(Rows):
 
 
 def _is_kept(values: AnyArray, dtype: type) -> bool:
-    """Whether a column is one already: of its type, row by row in memory, by itself, and read-only."""
+    """Whether an array is suitable as it is: of the column's type, in C order, owning its memory, and read-only."""
     return (
         isinstance(values, np.ndarray)
         and values.dtype == dtype
@@ -143,28 +145,28 @@ class Curves(Columns):
     side: Codes
 
 
-_BLOCK = 1 << 20  # rows at once: what is made of them stays small beside very many
+_BLOCK = 1 << 20  # rows processed at once, so that temporary arrays stay small for very large sets
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
-_ROW_NS = 10.0  # of what is looked at in a block
+_ROW_NS = 10.0  # ns, processor time for a row of a block
 C = TypeVar("C")
 T = TypeVar("T")
 
 
 def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
-    """Points, curves, or columns of another kind, at these rows only: their numbers, or True for each that stays."""
+    """Select rows of points, curves, or columns of another kind, by number or by a mask."""
     return type(columns)(**{name: _taken(column, rows) for name, column in vars(columns).items()})
 
 
 def joined(parts: Sequence[C]) -> C:
-    """Columns of one kind, one after the other."""
+    """Concatenate columns of one kind."""
     return type(parts[0])(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 
 
 def _taken(column: AnyArray, rows: Indices | Indices32 | Mask) -> AnyArray:
-    """Rows of a column; of one in a file, where they lie side by side, without mapping what is around them."""
-    most_runs = 10_000  # of rows side by side that are read one by one
+    """Select rows of a column; runs of rows of a column in a file are read without mapping what is around them."""
+    most_runs = 10_000  # largest number of runs of rows that are read one by one
     if not isinstance(column, np.memmap):
         return column[rows]
     numbers = np.flatnonzero(rows) if rows.dtype == bool else rows
@@ -176,7 +178,7 @@ def _taken(column: AnyArray, rows: Indices | Indices32 | Mask) -> AnyArray:
 
 
 class FileRows(Frozen, eq=True):
-    """Rows of a column in a file, which are read without becoming part of the process's memory for good."""
+    """Rows of a column in a file, which are read without remaining in the process's memory."""
 
     path: str
     offset: int
@@ -184,7 +186,7 @@ class FileRows(Frozen, eq=True):
     shape: tuple[int, ...]
 
     def read(self) -> AnyArray:
-        """The rows.
+        """Read the rows.
 
         Raises:
             InputError: the file is not there, or ends too early.
@@ -197,13 +199,13 @@ class FileRows(Frozen, eq=True):
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
         if values.size != size:
             raise InputError(f"{self.path}: it ends before its observations do: write it again")
-        values.shape = self.shape  # not a view of it: nobody else has it
+        values.shape = self.shape  # reshaped in place, as nothing else refers to it
         values.setflags(write=False)
         return values
 
 
 def rows_of(column: AnyArray, start: int, stop: int) -> AnyArray | FileRows:
-    """Some rows of a column, where they are."""
+    """Return some rows of a column, in memory or in its file as the column is."""
     rows = column[start:stop]
     if not isinstance(column, np.memmap):
         return rows
@@ -212,17 +214,19 @@ def rows_of(column: AnyArray, start: int, stop: int) -> AnyArray | FileRows:
 
 
 def read_rows(rows: AnyArray | FileRows) -> AnyArray:
-    """The rows, in memory."""
+    """Return the rows in memory."""
     return rows.read() if isinstance(rows, FileRows) else rows
 
 
 def in_blocks(columns: C) -> Iterator[tuple[int, C]]:
-    """The columns, or a single one, block by block, each in memory, with the number of its first row: at least one."""
+    """Yield the columns, or a single one, block by block in memory, with the number of each block's first row; at least
+    one block.
+    """
     return (_block(columns, number) for number in range(_blocks(columns)))
 
 
 def each_block(function: Callable[[int, C], T], columns: C) -> list[T]:
-    """function(number of its first row, block) of every block, in their order; some of them at the same time."""
+    """Return function(number of the first row, block) for every block, in their order; several run at the same time."""
 
     def part(first: int, last: int) -> list[T]:
         return [function(*_block(columns, number)) for number in range(first, last)]
@@ -245,7 +249,7 @@ def _block(columns: Any, number: int) -> tuple[int, Any]:
 
 
 def view_label(number: int, views: Sequence[View]) -> str:
-    """How messages name a view."""
+    """Name of a view in messages."""
     return f"view {number} (frame {views[number].frame!r})"
 
 
@@ -253,7 +257,9 @@ def view_label(number: int, views: Sequence[View]) -> str:
 
 
 def prior_to_json(prior: Prior) -> dict[str, Any]:
-    """A prior as the files have it: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`; null: nothing is known."""
+    """A prior in the form of the files: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`; sigma null: nothing is
+    known.
+    """
     value, sigma = (v[0] if len(v) == 1 else list(v) for v in (prior.value, prior.sigma))
     return {prior.owner: prior.name, prior.quantity: value, _sigma_of(prior.owner): None if prior.is_open else sigma}
 
@@ -263,7 +269,7 @@ def _sigma_of(owner: str) -> str:
 
 
 def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
-    """The prior that a file describes.
+    """Return the prior that a file describes.
 
     Raises:
         InputError: naming `where`, when the entry does not name one owner, one quantity and one sigma.

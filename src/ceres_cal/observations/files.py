@@ -1,4 +1,4 @@
-"""Observations in JSON and NPZ files and in folders of columns (docs/files.md): every number comes back exactly."""
+"""Observations in JSON and NPZ files and in folders of columns (docs/files.md); every number is preserved exactly."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
 class Content(Frozen):
-    """What a file holds, not checked: see `Observations`."""
+    """Content of a file, not checked: see `Observations`."""
 
     targets: Mapping[str, Target]
     cameras: Mapping[str, tuple[int, int]]
@@ -55,7 +55,7 @@ class Content(Frozen):
 
     @property
     def rows(self) -> int:
-        """How many observations there are, of points and of curves."""
+        """Number of observations, of points and of curves together."""
         return len(self.points) + len(self.curves)
 
     def feature_name(self, kind: str, row: int) -> str:
@@ -73,7 +73,7 @@ class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
     counts: list[int] | msgspec.UnsetType = msgspec.UNSET
 
     def each(self, here: str) -> list[str]:
-        """The feature of each pixel; InputError where `counts` does not fit."""
+        """Return the feature of each pixel; InputError where `counts` does not fit."""
         if not isinstance(self.counts, list):
             return self.features
         if len(self.counts) != len(self.features) or min(self.counts, default=1) < 1:
@@ -119,7 +119,7 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def content(self) -> Content:
-        """All but the columns; InputError naming the place."""
+        """Return everything except the columns; an InputError names the place."""
         return Content(
             targets_from_specs(self.targets),
             {name: camera.image_size for name, camera in self.cameras.items()},
@@ -163,7 +163,7 @@ def write_content(content: Content, path: Path) -> None:
 
 
 def header_of(content: Content) -> ObservationsFile:
-    """Everything but the columns, as a file has it."""
+    """Return everything except the columns, in the form of a file."""
     return ObservationsFile(
         format=FORMAT,
         version=VERSION,
@@ -201,7 +201,7 @@ def _concatenate(parts: Sequence[Any], dtype: Any) -> AnyArray:
 def _columns(
     entries: Sequence[tuple[int, _PointsFile]], views: Sequence[View], index: Mapping[str, Mapping[str, int]], kind: str
 ) -> dict[str, Any]:
-    """The columns of all views' features; InputError naming the view and the feature."""
+    """Return the columns of all views' features; an InputError names the view and the feature."""
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
@@ -271,7 +271,7 @@ def _rows_by_view(columns: Points | Curves, views: int) -> list[AnyArray]:
 
 
 def _features(columns: Points | Curves, rows: AnyArray, names: Sequence[str]) -> tuple[Any, Any, Any]:
-    """Names, pixels and sigmas as files have them."""
+    """Return names, pixels and sigmas in the form of the files."""
     features = [names[i] for i in columns.feature[rows]]
     return features, columns.pixels[rows].tolist(), _same_or_list(columns.sigma_px[rows])
 
@@ -299,7 +299,7 @@ def _from_npz(packed: bytes, where: str) -> Content:
 
 
 def _of_columns(header: ObservationsFile, arrays: Mapping[str, AnyArray]) -> Content:
-    """What a header and columns say."""
+    """Combine a header and columns."""
     points, curves = (
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
         for kind in ("points_", "curves_")
@@ -314,10 +314,10 @@ ENDING, HEADER = ".columns", "header.json"
 
 
 def write_folder(path: Path, header: Any, columns: Mapping[str, Columns]) -> None:
-    """Write a header and the columns of each kind beside the place, and rename the folder.
+    """Write a header and the columns of each kind into a temporary folder beside the destination, then rename it.
 
     Raises:
-        InputError: it is there already, or cannot be written.
+        InputError: the folder exists already, or cannot be written.
     """
     if path.exists():
         raise InputError(f"{path}: is there already: remove it, or give another name")
@@ -347,7 +347,7 @@ def _write(path: Path, array: AnyArray) -> None:
 
 
 def read_folder(path: Path, columns: Mapping[str, Column]) -> dict[str, AnyArray]:
-    """The columns of a folder, mapped.
+    """Return the columns of a folder, memory-mapped.
 
     Raises:
         InputError: a column is missing, cut short, or of another type or shape.
@@ -357,11 +357,11 @@ def read_folder(path: Path, columns: Mapping[str, Column]) -> dict[str, AnyArray
         file = path / f"{name}.npy"
         if not file.exists():
             raise InputError(f"{path}: column {name} is missing: write the folder again")
-        with opened(file):  # which refuses a pipe, where NumPy would wait for ever
+        with opened(file):  # refuses a pipe, on which NumPy would wait for ever
             pass
         try:
             arrays[name] = np.lib.format.open_memmap(file, mode="r")
-        except Exception as error:  # NumPy raises half a dozen kinds for a broken header
+        except Exception as error:  # NumPy raises half a dozen types of errors for a broken header
             raise InputError(f"{file}: cannot be read, it is cut short or no column ({error})") from None
         if not arrays[name].flags.c_contiguous:
             raise InputError(f"{file}: its rows do not lie one by one (Fortran order): save it in C order")

@@ -1,4 +1,4 @@
-"""Observations from arrays, as detectors give them: pixels by frame or by line, and what they show."""
+"""Observations from arrays as detectors return them: pixels by frame or by line, and what they show."""
 
 from __future__ import annotations
 
@@ -76,12 +76,12 @@ def pixels_by_curve(
 
 
 def _name(target: Target) -> str:
-    """As detected targets are named."""
+    """Name of a target, the same as for detected targets."""
     return "board" if target.movable else "field"
 
 
 def _points_target(places: Any, moves: bool) -> Target:
-    """A target of points (N, 3) or (N, 2) m, named by their numbers."""
+    """Make a target of points (N, 3) or (N, 2) m, named by their numbers."""
     from ceres_cal.scene.targets import of_places
 
     given = numbers_in(places, "points")
@@ -92,7 +92,7 @@ def _points_target(places: Any, moves: bool) -> Target:
 
 
 def _frames(pixels: Any) -> Mapping[str, Any]:
-    """By name of the frame; numbers where there are no names."""
+    """Return the pixels by name of the frame; frames without names are numbered."""
     if isinstance(pixels, Mapping):
         return {str(frame): values for frame, values in pixels.items()}
     if isinstance(pixels, np.ndarray) and (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[1] == 1)):
@@ -105,12 +105,12 @@ def _frames(pixels: Any) -> Mapping[str, Any]:
 
 
 def _is_pixel(value: Any) -> bool:
-    """Whether it is one pixel of a frame's list, not a frame."""
+    """Whether the value is one pixel of a frame's list rather than a frame."""
     is_flat = value.ndim == 1 if isinstance(value, np.ndarray) else isinstance(value, Sequence)
     return is_flat and len(value) == 2 and all(np.isscalar(one) for one in value)
 
 
 def _pixels(values: Any, where: str) -> Array:
-    """(N, 2), from that or OpenCV's (N, 1, 2)."""
+    """Return pixels (N, 2), given so or as OpenCV's (N, 1, 2)."""
     seen = numbers_in(values, "pixels")
     return rows(seen[:, 0] if seen.ndim == 3 and seen.shape[1] == 1 else seen, 2, f"{where}: pixels")

@@ -41,23 +41,23 @@ def _with_target(view: View) -> str:
 
 
 class Observations(Content):
-    """Everything that was observed.
+    """All observations of a calibration.
 
     Attributes:
         targets: by name.
         cameras: name -> (width, height) px.
-        views: what frame shows which target.
+        views: which frame shows which target.
         points: point observations, in the order of their views and in pixels with (0, 0) at the centre of the top-left
-            pixel. `sigma_px` is the standard deviation of each coordinate, 1 where nobody stated one (only ratios
-            matter then: the solve estimates the scale).
+            pixel. `sigma_px` is the standard deviation of each coordinate, 1 where none was stated (only ratios matter
+            then: the solve estimates the scale).
         curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
-        priors: what is known beforehand. notes: whatever somebody wants to keep with them, plain data.
-        noise: name of `noise_names` -> factor on the stated sigmas that `sigma_px` has in it already, as a calibration
-            found it; in no file.
+        priors: prior knowledge. notes: plain data that a user keeps with the observations.
+        noise: name of `noise_names` -> factor on the stated sigmas that `sigma_px` contains already, as a calibration
+            estimated it; in no file.
 
     Raises:
-        InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
-            finite, a camera without any observation.
+        InputError: on construction, naming the view and the feature: an unknown name, a number that is not finite, a
+            camera without any observation.
     """
 
     noise: Mapping[str, float] = field(default_factory=dict)
@@ -87,7 +87,7 @@ class Observations(Content):
             self.require_owner(prior)
 
     def __add__(self, other: Observations) -> Observations:
-        """Both together, as of several files: `field + board`."""
+        """Combine two sets, as from several files: `field + board`."""
         if not isinstance(other, Observations):
             return NotImplemented
         if twice := next((v for v in self.views if v.placement is not None and v in other.views), None):
@@ -111,15 +111,15 @@ class Observations(Content):
         sigma_px: float = 1.0,
         moves: bool | None = None,
     ) -> Observations:
-        """Observations of points of one target by one camera, in one frame or in many.
+        """Make observations of points of one target by one camera, in one frame or in many.
 
         Args:
-            pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
-                of the points, NaN where it was not seen.
+            pixels: (N, 2) or OpenCV's (N, 1, 2) of one frame, a list of those, or a dict by name of the frame; one row
+                for each point, NaN where it was not seen.
             points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
             image_size: (width, height) px. sigma_px: standard deviation of each coordinate.
-            moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
-                are the world.
+            moves: whether the target was elsewhere in every frame; by default as the target states. Places do not move:
+                they are in the world.
 
         Raises:
             InputError: shapes or counts that do not fit; naming the frame.
@@ -141,11 +141,11 @@ class Observations(Content):
         sigma_px: float = 1.0,
         side: str = "centre",
     ) -> Observations:
-        """Observations of painted lines and arcs of one target in one frame of one camera.
+        """Make observations of painted lines and arcs of one target in one frame of one camera.
 
         Args:
-            pixels: name of each line -> pixels (N, 2) that lie on it, anywhere along it, such as
-                `{"HalfwayLine": [[640.1, 92.4], [641.0, 180.2]]}`.
+            pixels: name of each line -> pixels (N, 2) anywhere along it, such as `{"HalfwayLine": [[640.1, 92.4],
+                [641.0, 180.2]]}`.
             image_size: (width, height) px. sigma_px: standard deviation of the distance to the line.
             side: "centre" of the paint, or its "left" or "right" edge, as seen along the line.
 
@@ -171,23 +171,23 @@ class Observations(Content):
             return observations
 
     def save(self, path: str | Path) -> None:
-        """Write `.json`, for large sets `.npz`, beyond memory a folder `.columns`; every number comes back exactly."""
+        """Write `.json`, for large sets `.npz`, beyond memory a folder `.columns`; every number is preserved."""
         write_content(self, Path(path))
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
+        """SHA-256 of the content, the same for the JSON and the NPZ file, by which calibrations refer to it."""
         header = msgspec.structs.replace(header_of(self), notes=msgspec.UNSET)
         content = hashlib.sha256(msgspec.json.encode(header))
         for column in (self.points, self.curves):
-            for name in vars(column):  # the whole of a column before the next
+            for name in vars(column):  # one whole column before the next
                 for _, block in in_blocks(getattr(column, name)):
                     content.update(np.ascontiguousarray(block).data)
         return content.hexdigest()
 
     @cached_property
     def ends(self) -> tuple[Indices, Indices]:
-        """(V + 1,) where the points of each view begin, and where its curve observations do."""
+        """(V + 1,) row at which the points of each view begin, and row at which its curve observations begin."""
         counts = np.zeros((2, len(self.views)), dtype=np.int64)
         for own, column in zip(counts, (self.points, self.curves), strict=True):
             for first, some in each_block(_counted, column.view):
@@ -199,22 +199,22 @@ class Observations(Content):
 
     @cached_property
     def copies(self) -> Copies:
-        """Which observations repeat others to the last bit: they count once."""
+        """Which observations repeat others to the last bit; these count once."""
         return find_copies(self.views, self.points, self.curves)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What may be wrong with the observations, a line each: strays outside an image, odd sizes."""
+        """One line for each thing that may be wrong with the observations: strays outside an image, odd sizes."""
         return (*self.require_inside(), *odd_sizes(self))
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """What was made of them, a line each: which are copies, that count once."""
+        """One line for each thing done with the observations: which are copies, so that they count once."""
         return tuple(self.copies.words(self.views, (self.points, self.curves)))
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
-        """The views with observations that are no copies; what the others name is not there for the solve."""
+        """The views with observations that are no copies; names in other views do not exist for the solve."""
         points, curves = self.copies.originals
         shown = np.zeros(len(self.views), dtype=bool)
         shown[self.points.view[points]] = shown[self.curves.view[curves]] = True
@@ -232,21 +232,21 @@ class Observations(Content):
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many views, cameras, stations, placements, points and curve observations there are."""
+        """Numbers of views, cameras, stations, placements, points and curve observations."""
         names = ("views", "cameras", "stations", "placements", "points", "curves")
         return {name: len(getattr(self, name)) for name in names}
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
     def part(self, points: Mask | Indices, curves: Mask | Indices) -> Observations:
-        """The same views with some of the observations: their numbers, or True for each that stays."""
+        """Return the same views with some of the observations, given by number or by a mask."""
         part = replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
-        if "copies" in vars(self) and not self.copies.are_there:  # nor does a part repeat anything
+        if "copies" in vars(self) and not self.copies.are_there:  # a part has no copies either
             vars(part)["copies"] = Copies(self.copies.points[points], self.copies.curves[curves])
         return part
 
     def with_targets(self, targets: Mapping[str, Target]) -> Observations:
-        """The same observations of targets that are drawn otherwise; their digest stays."""
+        """Return the same observations of targets with another drawing; the digest is kept."""
         each = [(target, targets[name]) for name, target in self.targets.items()]
         if all(one == other and one.movable == other.movable for one, other in each):
             return self
@@ -256,15 +256,15 @@ class Observations(Content):
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Whose noise each view has: of its camera, or "camera/target" where that sees several targets, which may be
-        clicked and detected.
+        """(V,) names of the noise of each view: its camera, or "camera/target" if the camera sees several targets,
+        which may be clicked and detected.
         """
         seen = {(view.camera, view.target) for view in self.views}
         several = {name for name, count in Counter(camera for camera, _ in seen).items() if count > 1}
         return tuple(_with_target(view) if view.camera in several else view.camera for view in self.views)
 
     def at_noise(self, noise: Mapping[str, float]) -> Observations:
-        """The same observations with sigmas at such a `noise` and no other; their digest stays."""
+        """Return the same observations with sigmas scaled by `noise` alone; the digest is kept."""
         if noise == self.noise:
             return self
         after, before = (
@@ -278,19 +278,19 @@ class Observations(Content):
         return rated
 
     def of_station(self, name: str) -> Observations:
-        """One station's views with all their observations, without priors."""
+        """Return one station's views with all their observations, without priors."""
         return self._of_views([view.station == name for view in self.views])
 
     def of_camera(self, name: str) -> Observations:
-        """The views of one camera, with the priors of what they show."""
+        """Return the views of one camera, with the priors on what they show."""
         return self if [*self.cameras] == [name] else self._about([view.camera == name for view in self.views])
 
     def without_camera(self, name: str) -> Observations:
-        """The views of the other cameras, with the priors of what they show."""
+        """Return the views of the other cameras, with the priors on what they show."""
         return self._about([view.camera != name for view in self.views])
 
     def about_shown(self, priors: Sequence[Prior]) -> tuple[Prior, ...]:
-        """Those priors that are about what the views show."""
+        """Return those priors that are on what the views show."""
         owners = {*self.cameras, *self.stations, *self.placements, *self.targets}
         return tuple(prior for prior in priors if prior.name in owners)
 
@@ -333,7 +333,7 @@ class Observations(Content):
         _require_letters("placement", placed)
 
     def _odd_view(self, number: int, owner: Mapping[str, str], placed: Mapping[str, str]) -> str:
-        """What is wrong with a view. owner, placed: camera of each station and target of each placement before."""
+        """What is wrong with a view. owner, placed: camera of each station and target of each placement before it."""
         here, view = view_label(number, self.views), self.views[number]
         if view.camera not in self.cameras:
             return f"{here}: {no_such('camera', view.camera, self.cameras)}"
@@ -347,7 +347,7 @@ class Observations(Content):
         )
 
     def _check_columns(self, kind: str, known: Indices, first: int, column: Columns) -> None:
-        """Of a block that begins with row `first`; known: features of each view's target."""
+        """Check a block that begins with row `first`; known: number of features of each view's target."""
         if not len(column):
             return
         if column.view.min() < 0 or column.view.max() >= len(self.views):
@@ -382,11 +382,11 @@ class Observations(Content):
                 )
 
     def require_inside(self) -> tuple[str, ...]:
-        """A line for each camera of which a few observations lie outside its image.
+        """Return one line for each camera of which a few observations lie outside its image.
 
         Raises:
-            InputError: more than a few do, or one by far; naming the likely cause, and view, feature and pixel of the
-                first. Or a sigma is so far from the others that one observation would decide alone.
+            InputError: many lie outside, or one far outside, naming the likely cause, and view, feature and pixel of
+                the first; or a sigma differs so much from the others that one observation would decide alone.
         """
         return self._strays
 
@@ -396,7 +396,7 @@ class Observations(Content):
         return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:
-        """Raise InputError where a prior names a camera, a station, a target or a curve that is not there."""
+        """Raise InputError where a prior names a camera, station, target or curve that does not exist."""
         every: dict[str, Iterable[str]] = {"camera": self.cameras, "station": self.stations, "target": self.targets}
         names = every[prior.owner]
         if prior.name not in names:
@@ -406,13 +406,13 @@ class Observations(Content):
 
 
 def _counted(_: int, views: Indices32) -> tuple[int, Indices]:
-    """The first view of a block in the order of its views, and how many rows it and each one behind it has."""
+    """Return the first view of a block sorted by view, and the number of rows of it and of each later view."""
     first = int(views[0]) if len(views) else 0
     return first, np.bincount(views - first)
 
 
 def combine(parts: Sequence[Observations]) -> Observations:
-    """Several sets as one: views one after the other, targets, cameras and priors together.
+    """Combine several sets into one: views one after the other, targets, cameras and priors merged.
 
     Raises:
         InputError: a target or camera means different things in two sets.
@@ -441,7 +441,7 @@ def combine(parts: Sequence[Observations]) -> Observations:
 
 
 def _require_letters(what: str, names: Iterable[str]) -> None:
-    """Raise InputError where a name holds bytes that are no UTF-8, as words of a command line may: no file can."""
+    """Raise InputError where a name is not UTF-8, as arguments of a command line may be; no file could hold it."""
     try:
         "".join(names).encode()
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""Which frames of several cameras are one moment: said by a rule, never guessed."""
+"""Frames of several cameras that were taken at the same moment, as stated by a rule and never guessed."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from ceres_cal.observations.observations import Observations
 
 RULES = "'left*,right*' (what * stands for names the moment), index (in their order), or within:0.01 (numbers as names)"
 
-_Frames = Mapping[str, tuple[str, ...]]  # of each camera, in the order of its views
-_Moments = Mapping[tuple[str, str], str]  # by camera and frame
+_Frames = Mapping[str, tuple[str, ...]]  # names of each camera's frames, in the order of its views
+_Moments = Mapping[tuple[str, str], str]  # name of the moment, by camera and frame
 
 
 def with_same_frames(observations: Observations, rule: str) -> Observations:
-    """The observations with the frames of its cameras renamed, so that those of one moment have one name.
+    """Return the observations with frames renamed so that frames of one moment have one name in all cameras.
 
-    A placement that is named like its frame, as detected boards are, is renamed with it: then the cameras see one
-    board at one place.
+    A placement that has its frame's name, as detected boards have, is renamed, too: then the cameras see one board at
+    one place.
 
     Args:
-        rule: patterns between commas, of which one fits each frame, as "left*,right*": what * stands for is the moment.
-            "index": the n-th frames of all cameras belong together. "within:T": frames are numbers, such as time
-            stamps; the nearest of two cameras belong together where they are T or less apart.
+        rule: patterns separated by commas, exactly one of which fits each frame, such as "left*,right*"; what * stands
+            for names the moment. "index": the n-th frames of all cameras belong together. "within:T": frame names are
+            numbers, such as time stamps; frames of two cameras belong together if they are T or less apart.
 
     Raises:
-        InputError: a frame that no pattern or more than one fits, other numbers of frames for "index", names that are
-            no numbers, T that is as long as the frames of one camera are apart; or nothing comes together.
+        InputError: a frame that no pattern or more than one fits, different numbers of frames for "index", names that
+            are no numbers, T at least half of the distance between frames of one camera, or no frames that belong
+            together.
     """
     frames: dict[str, tuple[str, ...]] = {}
     for camera in observations.cameras:

@@ -1,15 +1,15 @@
-"""Sights: the observations as the method takes them, sorted by the pose that they depend on.
+"""Sights: the observations as the method uses them, sorted by the pose that they depend on.
 
 A view is what one frame shows of one target. A *sight* is what one camera at one station sees of one rigid frame, over
 all its views; the frame is the world or a placement. All observations of a sight are projected by one pose,
 cam_from_frame, so a sight is a block of rows of the least-squares problem: a static camera's thousand frames of a field
-are one sight, a board held at twenty places is twenty. Nearly everything that follows runs over sights, and rows are
-kept so that residuals find their way back to the observations' permanent ids.
+are one sight, a board held at twenty places is twenty. Nearly all later steps work on sights, and row numbers are kept
+so that residuals can be assigned to the observations' permanent ids.
 
 Features are numbered in two ways. Observations number them within their target, in the order of its names (`feature` of
 `Points` and `Curves`). Sights number them across all targets, one target after the other: `point_index` is a row of all
-points; `track_index` is a row of all tracks, three sets for each target: of the curves' centres, of their left borders
-and of their right ones.
+points; `track_index` is a row of all tracks, which are three sets for each target: the curves' centres, their left
+borders and their right borders.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, dis
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene import Camera, nearest_to_rays
 
-_RUN = 256  # rows between two that go, from which on those between are moved together
+_RUN = 256  # mean number of rows between two removed ones from which on the rows between are copied as runs
 _Rows: TypeAlias = "Indices | slice | list[slice]"
 
 Owner = tuple[str, str]
-"""Whose numbers they are that a solver moves together: a "camera", "station" or "placement", and its name."""
+"""Owner of numbers that a solver updates together: "camera", "station" or "placement", and its name."""
 
 STRUCTURE: Owner = ("structure", "")
-"""Of all targets."""
+"""Owner of the structure of all targets."""
 
 
 class SightKey(NamedTuple):
@@ -48,21 +48,21 @@ class SightKey(NamedTuple):
 
     @property
     def owners(self) -> tuple[Owner, ...]:
-        """Of the numbers that it depends on: its camera, station, placement, and the structure."""
+        """Owners of the numbers that the sight depends on: its camera, station, placement, and the structure."""
         return ("camera", self.camera), ("station", self.station), ("placement", self.placement or ""), STRUCTURE
 
 
 class Sights(Frozen, Sequence["Sights"]):
-    """Some sights, their observations one after the other; one sight is a `Sights` of length one.
+    """Some sights, with their observations one after the other; one sight is a `Sights` of length one.
 
     Attributes:
-        observations: all of them. keys: of each of the S sights. views: numbers of the views that each sight gathers.
+        observations: the whole set. keys: (S,) of the sights. views: numbers of the views of each sight.
         point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
         point_index: (N,) number among the points of all targets. points: (N, 3) m in the sight's frame.
-        pixels: (N, 2). sigma_px: (N,).
-        curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
-        track_index: (M,) number among tracks (T, 3, 3) and is_arc (T,): every side and curve of every target (see
-            `curves.along_track`).
+        pixels: (N, 2) px. sigma_px: (N,).
+        curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the corresponding columns of the M curve observations.
+        track_index: (M,) number among the tracks.
+        tracks, is_arc: (T, 3, 3) and (T,) of every side and curve of every target (see `curves.along_track`).
     """
 
     observations: Observations
@@ -103,29 +103,29 @@ class Sights(Frozen, Sequence["Sights"]):
 
     @cached_property
     def seen_once(self) -> frozenset[str | None]:
-        """Placements that a single one of the sights shows."""
+        """Placements that only one of the sights shows."""
         times = Counter(map(itemgetter(2), self.keys))
         return frozenset(name for name, count in times.items() if count == 1)
 
     @property
     def on_arc(self) -> Mask:
-        """(M,) whether each curve observation is one of an arc, not of a straight line."""
+        """(M,) whether each curve observation is on an arc rather than a straight line."""
         return np.asarray(self.is_arc[self.track_index])
 
     @property
     def equations(self) -> int:
-        """Measured numbers: two of each point, one of each curve observation."""
+        """Number of measured numbers: two for each point, one for each curve observation."""
         return 2 * len(self.point_rows) + len(self.curve_rows)
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, each once."""
+        """Names of the cameras, without repetition."""
         return tuple(dict.fromkeys(map(itemgetter(0), self.keys)))
 
     def numbers(
         self, camera: str | None = None, station: str | None = None, placements: Container[str | None] | None = None
     ) -> Indices:
-        """Numbers of the sights of this camera, station and these placements; None asks for nothing."""
+        """Numbers of the sights of this camera, station and these placements; None is no restriction."""
         if self.cameras == (camera,):
             camera = None
         if camera is station is placements is None:
@@ -138,23 +138,23 @@ class Sights(Frozen, Sequence["Sights"]):
         return np.flatnonzero(chosen)
 
     def of_camera(self, name: str) -> Sights:
-        """The sights of one camera."""
+        """Return the sights of one camera."""
         return self.take(self.numbers(camera=name))
 
     @property
     def of_world(self) -> dict[str, Sights]:
-        """What each station sees of the world."""
+        """Name of a station -> its sight of the world."""
         return {self.keys[number].station: self[int(number)] for number in self.numbers(placements=(None,))}
 
     def take(self, numbers: Indices) -> Sights:
-        """The sights with these numbers, in this order."""
+        """Return the sights with these numbers, in this order."""
         if len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self))):
             return self
         p, c = ranges(self.point_bounds, numbers), ranges(self.curve_bounds, numbers)
         return self._rows(numbers, p, c, np.diff(self.point_bounds)[numbers], np.diff(self.curve_bounds)[numbers])
 
     def used_share(self, points: Mask, curves: Mask) -> Array:
-        """(S,) the share of each sight's observations that is used."""
+        """(S,) share of each sight's observations that are used."""
         if points.all() and curves.all():
             return np.ones(len(self))
         p = bounds_of(points[self.point_rows])[self.point_bounds]
@@ -162,17 +162,17 @@ class Sights(Frozen, Sequence["Sights"]):
         return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
 
     def about(self, camera: Camera) -> Sights:
-        """The sights, which are the camera's, with pixels as offsets from its principal point on square pixels."""
+        """Return the sights of this camera with pixels as offsets from its principal point, on square pixels."""
         return replace(self, pixels=camera.offsets(self.pixels), curve_pixels=camera.offsets(self.curve_pixels))
 
     @property
     def reach_px(self) -> float:
-        """Largest length of a pixel: of sights `about` their camera how far observations reach from the centre."""
+        """Largest length of a pixel vector; after `about`, how far observations are from the principal point, px."""
         columns = (self.pixels.T, self.curve_pixels.T)
         return float(np.sqrt(max(np.max(x * x + y * y, initial=0.0) for x, y in columns)))
 
     def part(self, number: int, count: int) -> Sights:
-        """The number-th of `count` about equal parts of the observations of a single sight."""
+        """Return part `number` of `count` nearly equal parts of a single sight's observations."""
         first, last = (int(self.point_bounds[-1]) * n // count for n in (number, number + 1))
         start, stop = (int(self.curve_bounds[-1]) * n // count for n in (number, number + 1))
         here = np.zeros(1, dtype=np.int64)
@@ -181,7 +181,7 @@ class Sights(Frozen, Sequence["Sights"]):
         )
 
     def used(self, points: Mask, curves: Mask) -> Sights:
-        """What is left of every sight when only these rows of the observations count; empty sights are left out."""
+        """Return the sights with only these rows of the observations; empty sights are left out."""
         if points.all() and curves.all():
             return self
         p, point_sizes = _left(points[self.point_rows], self.point_bounds)
@@ -190,8 +190,8 @@ class Sights(Frozen, Sequence["Sights"]):
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
     def by_feature(self, whole: Mask, *, halved: bool = False) -> Sights:
-        """Each sight as one of every feature that it shows, or of every half of a curve in the image; those (S,) that
-        are to stay whole as they are.
+        """Split each sight into one for every feature that it shows, or for every half of a curve in the image; the
+        sights in the mask `whole` (S,) are not split.
         """
         if whole.all():
             return self
@@ -207,7 +207,7 @@ class Sights(Frozen, Sequence["Sights"]):
         return self._rows(names // span, np.argsort(p, kind="stable"), np.argsort(c, kind="stable"), *sizes)
 
     def _halves(self, sight: Indices) -> Indices:
-        """(M,) in which half of its curve an observation of a sight (M,) lies, 0 or 1."""
+        """(M,) which half of its curve each observation of a sight (M,) lies in, 0 or 1."""
         half = np.zeros(len(sight), dtype=np.int64)
         curve = sight * (1 + int(self.track_index.max(initial=0))) + self.track_index
         for one in np.unique(curve):
@@ -217,12 +217,12 @@ class Sights(Frozen, Sequence["Sights"]):
         return half
 
     def displaced(self, points: Array, curves: Array) -> Sights:
-        """With every observation shifted, (N, 2) and (M, 2) px by row of the observations."""
+        """Return the sights with every observation shifted, by (N, 2) and (M, 2) px in the rows of the observations."""
         pixels, curve_pixels = self.pixels + points[self.point_rows], self.curve_pixels + curves[self.curve_rows]
         return replace(self, pixels=pixels, curve_pixels=curve_pixels)
 
     def renumbered(self, points: Indices, curves: Indices) -> Sights:
-        """The sights of some of the observations, by ascending row, as rows of these alone."""
+        """Return the sights of some of the observations, given by ascending rows, renumbered as rows of these alone."""
         p, c = (np.full(int(rows.max(initial=-1)) + 1, -1) for rows in (self.point_rows, self.curve_rows))
         p[points], c[curves] = np.arange(len(points)), np.arange(len(curves))
         own = self.used(p >= 0, c >= 0)
@@ -231,7 +231,7 @@ class Sights(Frozen, Sequence["Sights"]):
 
     @property
     def by_kind(self) -> tuple[Sights, Sights]:
-        """The same sights with their points alone, and with their curve observations alone."""
+        """The sights with their points alone, and with their curve observations alone."""
         nothing, every = np.zeros(len(self), dtype=np.int64), np.arange(len(self))
         return (
             self._rows(every, slice(None), slice(0, 0), np.diff(self.point_bounds), nothing),
@@ -262,14 +262,16 @@ class Sights(Frozen, Sequence["Sights"]):
 
 
 def _at(values: AnyArray, rows: _Rows) -> AnyArray:
-    """values[rows]; `take` is several times as fast where a row holds more than one number, and runs of rows again."""
+    """values[rows]. `take` is several times as fast where a row holds more than one number; runs of rows are faster
+    still.
+    """
     if isinstance(rows, list):
         return np.concatenate([values[run] for run in rows])
     return values[rows] if isinstance(rows, slice) else values.take(rows, axis=0)
 
 
 def _left(stays: Mask, bounds: Indices) -> tuple[_Rows, Indices]:
-    """The rows that stay, as runs where few go, and how many of each sight do."""
+    """Return the rows that stay, as runs if few are removed, and the number of rows that stay in each sight."""
     gone = np.flatnonzero(~stays)
     sizes = np.diff(bounds) - np.diff(np.searchsorted(gone, bounds))
     if len(gone) * _RUN > len(stays):
@@ -278,31 +280,31 @@ def _left(stays: Mask, bounds: Indices) -> tuple[_Rows, Indices]:
 
 
 def bounds_of(sizes: Sequence[int] | AnyArray) -> Indices:
-    """(S + 1,) where each of so many rows begins, one after the other, and where the last one ends."""
+    """(S + 1,) where each of S consecutive runs of these sizes begins, and where the last one ends."""
     bounds = np.zeros(len(sizes) + 1, dtype=np.int64)
     np.cumsum(sizes, out=bounds[1:])
     return bounds
 
 
 def ranges(bounds: Indices, numbers: Indices) -> Indices:
-    """All row numbers from bounds[i] to bounds[i + 1], for each i of numbers in turn."""
+    """Row numbers from bounds[i] to bounds[i + 1], for each i of `numbers` in turn."""
     sizes = np.diff(bounds)[numbers]
     starts = np.repeat(bounds[numbers] - bounds_of(sizes)[:-1], sizes)
     return np.asarray(starts + np.arange(sizes.sum()))
 
 
 def gather_sights(observations: Observations, *, predicted: bool = False) -> Sights:
-    """The sights of all observations that are no copies of others; a sight without any is left out.
+    """Return the sights of all observations that are no copies of others; empty sights are left out.
 
     Args:
-        predicted: that they were never measured: without noise frames of a static camera look like copies.
+        predicted: whether the observations are predictions: without noise, frames of a static camera look like copies.
     """
     every = sights_of(observations)
     return every if predicted else every.used(*observations.copies.originals)
 
 
 def sights_of(observations: Observations) -> Sights:
-    """The sights of all observations; a sight without any is left out."""
+    """Return the sights of all observations; empty sights are left out."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = tuple(dict.fromkeys(keys))
     sight_of_view, views_of = numbers_of(keys, order), [list[int]() for _ in order]
@@ -344,7 +346,7 @@ def sights_of(observations: Observations) -> Sights:
 
 
 def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indices | slice, Indices]:
-    """Rows in the order of their sights, all of them as they are where that is their order; where each sight begins."""
+    """Return the rows in the order of their sights (a slice if already sorted), and where each sight begins."""
     sight = sight_of_view[columns.view]
     if np.all(sight[1:] >= sight[:-1]):
         return slice(None), np.searchsorted(sight, np.arange(count + 1))
@@ -353,12 +355,12 @@ def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indi
 
 
 def nearest_feet(sight: Sights, camera: Camera) -> Array:
-    """Where on its track each curve observation's ray passes nearest, (M,): the start of the search for the foot.
+    """(M,) parameter on the track where each curve observation's ray passes nearest: the initial estimate of its foot.
 
-    `camera` stands in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
+    `camera` is posed in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
     taken.
     """
-    block = 1 << 16  # rows worked on at once: memory stays small beside the observations
+    block = 1 << 16  # rows processed at once, so that memory stays small compared with the observations
     blocks = range(0, len(sight.curve_pixels), block)
     return np.concatenate([np.empty(0), *(_nearest(sight, camera, slice(at, at + block)) for at in blocks)])
 
@@ -372,11 +374,11 @@ def _nearest(sight: Sights, camera: Camera, rows: slice) -> Array:
 # ---- some of the observations, evenly, where all of them would take too long ----------------------------------------
 
 MANY = 2_000_000
-"""Observations of the world from which on a part decides, and the rest answers with sums."""
+"""Number of observations of the world above which a subset decides, and the others contribute by sums."""
 
 
 def is_bulk(observations: Observations) -> bool:
-    """Whether a part is to decide."""
+    """Whether a subset of the observations is to decide."""
     if observations.rows <= MANY:
         return False
     world = np.array([view.placement is None for view in observations.views])
@@ -384,19 +386,19 @@ def is_bulk(observations: Observations) -> bool:
 
 
 def column_of(observations: Observations, name: str) -> AnyArray:
-    """(N + M,) one column of the points, then of the curves."""
+    """(N + M,) one column of the points followed by that of the curves."""
     return np.concatenate([getattr(observations.points, name), getattr(observations.curves, name)])
 
 
 def shown_rows(sights: Sights) -> Mask:
-    """(N + M,) the observations that sights show, points by row and then curves by row."""
+    """(N + M,) mask of the observations in the sights: points by row, then curves by row."""
     rows = np.zeros(sights.observations.rows, dtype=bool)
     rows[sights.point_rows] = rows[len(sights.observations.points) + sights.curve_rows] = True
     return rows
 
 
 def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
-    """Names of the frames that show anything, and (N + M,) the frame's number of each observation."""
+    """Return the names of the frames that show anything, and (N + M,) the number of each observation's frame."""
     views = column_of(observations, "view")
     names = dict.fromkeys(observations.views[int(view)].frame for view in distinct(views))
     order = {name: number for number, name in enumerate(names)}
@@ -404,7 +406,7 @@ def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
 
 
 def thinned(observations: Observations, most: int, fewest_frames: int = 40) -> Observations:
-    """Evenly spread frames, and of these evenly spread observations, about `most` in all."""
+    """Select evenly spread frames, and evenly spread observations in them, about `most` in all."""
     if observations.rows <= most:
         return observations
     names, frame = frames_of(observations)
@@ -420,8 +422,8 @@ def thinned(observations: Observations, most: int, fewest_frames: int = 40) -> O
 
 
 def some_views(counts: Indices, most: int, fewest: int) -> Indices:
-    """Numbers of some of the views that show anything, so many observations (V,) each, evenly: as many as hold what is
-    asked, and no fewer than a few.
+    """Numbers of an evenly spread selection of the views with observations: enough views for about `most` observations,
+    but at least `fewest` views. `counts` (V,) is the number of observations in each view.
     """
     shown = np.flatnonzero(counts)
     taken = min(max(fewest, len(shown) * most // int(counts.sum())), len(shown))
@@ -429,7 +431,7 @@ def some_views(counts: Indices, most: int, fewest: int) -> Indices:
 
 
 def thinned_by_key(rows: Indices, key: Indices, of_group: Mask, most_rows: int) -> Indices:
-    """Of rows with the same key some, evenly, where they are of a group: so many at most."""
+    """Thin rows of a group evenly to at most `most_rows` for each key; rows outside the group are kept."""
     order = np.argsort(key, kind="stable")
     _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
     place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)

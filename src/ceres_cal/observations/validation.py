@@ -1,14 +1,14 @@
-"""What is odd about observations: pixels outside their image, sigmas and sizes that cannot be; and rows there twice.
+"""Checks of observations: pixels outside their image, impossible sigmas and sizes, and repeated rows.
 
-A few pixels outside are strays, many mean that the image size is another one.
+A few pixels outside an image are strays; many mean that the image size is wrong.
 
-Observations that are there twice: the same rows again, the same frame under another name, one file given twice.
+Observations may be repeated: the same rows again, the same frame under another name, one file given twice.
 
 Two measurements of one thing never agree in every bit of a sub-pixel position, and two that are rounded to the same
-number share the error of rounding: either way the second says nothing new, and counting it would shrink every standard
-deviation. A copy is told bit for bit: a row by a row of the same frame, a whole view by an earlier view of the same
-target from the same station. A single row that comes again in another frame is not one: a static camera and a detector
-of whole pixels may well give it.
+number share the rounding error. In both cases the second adds no information, and counting it would shrink every
+standard deviation. Copies are found bit for bit: a row that repeats a row of the same frame, or a whole view that
+repeats an earlier view of the same target from the same station. A single row that is repeated in another frame is no
+copy: a static camera and a detector of whole pixels may well produce it.
 """
 
 from __future__ import annotations
@@ -25,21 +25,24 @@ from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
 _MARGIN_PX = 1.5
-# Of a camera's observations: more of them outside, and its image has another size.
+# Largest share of a camera's observations outside its image; if there are more, the image has another size.
 _FEW = 0.01
-_FAR = 10.0  # image diagonals: a pixel farther off was not measured, and its square swamps what was
-# The largest playing fields have 126 m from corner to corner; a board of 200 mm has as much in millimetres.
+_FAR = 10.0  # image diagonals: a pixel farther off was not measured, and its square dominates what was
+# Largest size of a target in metres. The largest playing fields have 126 m from corner to corner; a board of 200 mm has
+# this size in millimetres.
 _LARGE_M = 200.0
-# From the origin of a target's numbers, whence digits are lost: one in eight solves over a parking lot does not come to
-# rest there, none at a tenth of it, three in eight at ten times as far.
+# Distance from the origin of a target's coordinates, m, beyond which digits are lost: one in eight solves over a
+# parking lot does not converge at this distance, none at a tenth of it, three in eight at ten times as far.
 _REMOTE_M = 1e5
-# Of the largest sigma over the smallest: from ten pixels by a click to a thousandth of a pixel by a large target in the
-# image. Beyond it one observation decides alone, and nothing contradicts it.
+# Largest ratio of the sigmas: from ten pixels for a click to a thousandth of a pixel for a large target in the image.
+# Beyond it one observation decides alone, and nothing contradicts it.
 _SIGMA_RATIO = 1e4
 
 
 def require_alike(content: Content) -> None:
-    """Raise InputError where a sigma is so far from the others that its observation, or they, decide nothing."""
+    """Raise InputError where a sigma differs so much from the others that its observation, or the others, have no
+    effect.
+    """
     columns = {"point": content.points, "curve": content.curves}
     ends = [end for column in columns.values() for end in each_block(_extremes, column.sigma_px)]
     if max(high for _, high in ends) <= _SIGMA_RATIO * min(low for low, _ in ends):
@@ -56,12 +59,12 @@ def require_alike(content: Content) -> None:
 
 
 def _extremes(_: int, block: Array) -> tuple[float, float]:
-    """The smallest and the largest of a block."""
+    """Return the smallest and the largest value of a block."""
     return (float(block.min()), float(block.max())) if len(block) else (np.inf, 0.0)
 
 
 def stray_pixels(content: Content) -> tuple[str, ...]:
-    """A line for each camera of which a few observations lie outside its image.
+    """Return one line for each camera of which a few observations lie outside its image.
 
     Raises:
         InputError: naming the first of them, where they are more than one in a hundred (and not a single one).
@@ -113,13 +116,13 @@ def _end(size: Sequence[int] | Array) -> Array:
 
 
 def _outside(column: Columns, sizes: Array) -> Mask:
-    """(N,) which observations lie outside; `sizes` (V, 2) is that of each view's image."""
+    """(N,) which observations lie outside; `sizes` (V, 2) are those of the views' images."""
     seen = column.pixels
     return np.asarray(np.any((seen < -_MARGIN_PX) | (seen > _end(sizes[column.view])), axis=1))
 
 
 def _cause(pixels: Array, size: Sequence[int]) -> str:
-    """What the pixels say is wrong with the image size, or with themselves."""
+    """Return what the pixels show to be wrong with the image size, or with themselves."""
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     width, height = size
     if left < -_MARGIN_PX or top < -_MARGIN_PX:
@@ -142,24 +145,24 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
 
 
 def require_filled(content: Content) -> None:
-    """Raise InputError where the observations of a camera all lie in a tenth of its image's sides: as many images away
-    as a pixel may lie outside of one. What comes of such a picture hangs on the rounding of numbers.
+    """Raise InputError where the observations of a camera all lie within a tenth of its image's width and height; the
+    factor is that by which a pixel may lie outside. A solve with such a picture depends on rounding.
     """
     for odd in unfilled(content, 1.0 / _FAR):
         raise InputError(odd)
 
 
 def unfilled(content: Content, corner: float = 0.25) -> Iterator[str]:
-    """A line for each camera whose observations all lie in a small corner of its image.
+    """Yield one line for each camera whose observations all lie in a small corner of its image.
 
     Args:
-        corner: of either side: a board that is always held so far from the middle of the image is rare.
+        corner: share of either side; a board that is always held so far from the middle of the image is rare.
     """
     reach = dict.fromkeys(content.cameras, np.zeros(2))
     owners = np.array([view.camera for view in content.views])
     for column in (content.points, content.curves):
         for _, block in in_blocks(column):
-            for camera in _within(content, reach, corner):  # of most all is said by the first block
+            for camera in _within(content, reach, corner):  # for most cameras the first block is enough
                 seen = block.pixels[(owners == camera)[block.view]]
                 reach[camera] = np.maximum(reach[camera], np.max(seen, axis=0, initial=0.0))
     for camera in _within(content, reach, corner):
@@ -171,13 +174,13 @@ def unfilled(content: Content, corner: float = 0.25) -> Iterator[str]:
 
 
 def _within(content: Content, reach: Mapping[str, Array], corner: float) -> list[str]:
-    """Cameras whose observations reach less far than a corner of their images."""
+    """Return the cameras whose observations do not extend beyond a corner of their images."""
     return [name for name, size in content.cameras.items() if np.all(reach[name] < corner * np.array(size))]
 
 
 def odd_sizes(content: Content) -> Iterator[str]:
-    """A line for each target so large that its numbers may be millimetres, or so far from their origin that digits are
-    lost.
+    """Yield one line for each target so large that its numbers may be millimetres, or so far from their origin that
+    digits are lost.
     """
     for name, target in content.targets.items():
         size_m = float(np.linalg.norm(np.ptp(target.places, axis=0)))
@@ -192,7 +195,7 @@ def odd_sizes(content: Content) -> Iterator[str]:
 
 Hashes = NDArray[np.uint64]
 
-# Large odd numbers without pattern, those of splitmix64: what the parts of a row are multiplied with.
+# Large odd numbers without pattern, those of splitmix64, by which the parts of a row are multiplied.
 _X, _FEATURE, _FRAME = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
@@ -200,7 +203,7 @@ class Copies(Frozen):
     """Which observations repeat others.
 
     Attributes:
-        points: (N,), curves: (M,) number of the view that each row is a copy out of; -1 for what is no copy.
+        points, curves: (N,) and (M,) number of the view that each row is copied from; -1 for rows that are no copies.
     """
 
     points: Indices
@@ -208,16 +211,16 @@ class Copies(Frozen):
 
     @property
     def are_there(self) -> bool:
-        """Whether there is any."""
+        """Whether there are any copies."""
         return any(len(source) and source.strides[0] and np.any(source >= 0) for source in (self.points, self.curves))
 
     @cached_property
     def originals(self) -> tuple[Mask, Mask]:
-        """(N,) of points and (M,) of curve observations: what counts."""
+        """(N,) and (M,) masks of the points and curve observations that count."""
         return self.points < 0, self.curves < 0
 
     def words(self, views: Sequence[View], columns: tuple[Columns, Columns]) -> Iterator[str]:
-        """What was counted once: a line for copied frames, and one for rows that are there twice in theirs."""
+        """Yield what was counted once: a line for copied frames, and one for rows repeated within their frame."""
         if not self.are_there:
             return
         rows: Counter[tuple[str, str]] = Counter()
@@ -236,9 +239,9 @@ class Copies(Frozen):
 
 
 def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies:
-    """The observations that repeat earlier ones.
+    """Return which observations repeat earlier ones.
 
-    Hashes of the rows say in half a millisecond for 1000 frames that there are none; where some agree the rows
+    Hashes of the rows show in half a millisecond for 1000 frames that there are none; where hashes agree, the rows
     themselves are compared.
     """
     columns: tuple[Columns, Columns] = (points, curves)
@@ -256,7 +259,7 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
 
 
 def _may_repeat(column: Columns, place: Indices) -> bool:
-    """Whether rows near one another agree or, of very many, whole views."""
+    """Whether rows within a block agree, or whole views anywhere."""
     of_views, repeat = np.zeros(len(place), dtype=np.uint64), False
     for views, sums, some in each_block(_looked_at, column):
         np.add.at(of_views, views, sums)
@@ -269,7 +272,7 @@ def _may_repeat(column: Columns, place: Indices) -> bool:
 
 
 def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
-    """Views, the sum of their rows' hashes, and whether rows agree."""
+    """Return the views of a block, the sum of the hashes of each one's rows, and whether any rows agree."""
     hashes = _row_hashes(block)
     if not len(hashes):
         return np.empty(0, dtype=np.int64), hashes, False
@@ -280,9 +283,9 @@ def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
 
 
 def _row_hashes(column: Columns) -> Hashes:
-    """(N,) of what each row says but for its view and its sigma: feature, side and both coordinates, to the last bit.
+    """(N,) hash of each row without view and sigma: feature, side and both coordinates, to the last bit.
 
-    Equal where the rows are; of others hardly ever.
+    Hashes of equal rows are equal; those of different rows hardly ever.
     """
     x, y = np.ascontiguousarray(column.pixels).view(np.uint64).T
     hashes = column.feature.astype(np.uint64)
@@ -295,22 +298,22 @@ def _row_hashes(column: Columns) -> Hashes:
 
 
 def _repeated(hashes: Hashes) -> Mask:
-    """(N,) whether another one is the same."""
+    """(N,) whether the same hash occurs again."""
     _, number, count = np.unique(hashes, return_inverse=True, return_counts=True)
     return np.asarray(count[number] > 1)
 
 
 def _parts(column: Columns, rows: Indices) -> tuple[NDArray[np.generic], ...]:
-    """What these rows say, each part a column."""
+    """Return the content of these rows, each part as a column."""
     side = column.side[rows] if isinstance(column, Curves) else np.zeros(len(rows), np.int8)
     return (*column.pixels[rows].T, side, column.feature[rows])
 
 
 def _mark_rows(column: Columns, hashes: Hashes, frame: Indices, source: Indices) -> None:
-    """Rows that repeat an earlier one of the same frame; `frame` (V,) is the number of each view's."""
+    """Mark rows that repeat an earlier one of the same frame; `frame` (V,) is the number of each view's frame."""
     rows = np.flatnonzero(_repeated(hashes + frame[column.view].astype(np.uint64) * _FRAME))
     said = (*_parts(column, rows), frame[column.view[rows]])
-    order = np.lexsort(said)  # which is stable: of those that agree the earliest comes first
+    order = np.lexsort(said)  # a stable sort: the earliest of equal rows comes first
     if not len(rows):
         return
     same = np.all([part[order][1:] == part[order][:-1] for part in said], axis=0)
@@ -322,8 +325,10 @@ def _mark_rows(column: Columns, hashes: Hashes, frame: Indices, source: Indices)
 def _mark_views(
     columns: tuple[Columns, Columns], hashes: Sequence[Hashes], place: Indices, sources: tuple[Indices, ...]
 ) -> None:
-    """Rows of views all of whose rows repeat those of an earlier one; `place` (V,): of the same station and target."""
-    least_rows = 4  # of a view that copies another: fewer whole pixels agree by chance
+    """Mark rows of views that repeat an earlier view of the same station and target entirely; `place` (V,) numbers
+    these.
+    """
+    least_rows = 4  # least number of rows of a copied view: fewer whole pixels agree by chance
     contents: list[list[Hashable]] = [[int(number)] for number in place]
     sizes, differs = np.zeros(len(place), dtype=np.int64), np.zeros(len(place), dtype=bool)
     own = [source < 0 for source in sources]
