@@ -21,14 +21,14 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 Column = tuple[Any, tuple[int | str, ...]]
-"""What a column must be: its type, and its lengths; a letter stands for one and the same length in all columns."""
+"""Type and lengths that a column must have; a letter stands for a length that is the same in all columns."""
 
 
 def read_npz(content: bytes, columns: Mapping[str, Column], where: str) -> dict[str, AnyArray]:
-    """The columns of an NPZ file, each as it is described.
+    """Read the columns of an NPZ file, each as it is described.
 
     Raises:
-        InputError: no NPZ file, cut short, pickled objects, a column that is missing, unknown, there twice, too large,
+        InputError: no NPZ file, cut short, pickled objects, a column that is missing, unknown, duplicated, too large,
             or of another type or shape.
     """
     arrays = _read(content, columns, where)
@@ -37,10 +37,10 @@ def read_npz(content: bytes, columns: Mapping[str, Column], where: str) -> dict[
 
 
 def read_foreign_npz(content: bytes, where: str) -> dict[str, AnyArray]:
-    """The columns of an NPZ file that others wrote, whatever they are.
+    """Read the columns of an NPZ file of another program, whatever they are.
 
     Raises:
-        InputError: no NPZ file, cut short, pickled objects, a column that is there twice, or too large.
+        InputError: no NPZ file, cut short, pickled objects, a column that is duplicated or too large.
     """
     return _read(content, None, where)
 
@@ -54,7 +54,7 @@ def _read(content: bytes, columns: Mapping[str, Column] | None, where: str) -> d
             return {name: _column(archive, name, None if columns is None else columns[name], where) for name in names}
     except InputError:
         raise
-    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen kinds for a broken archive
+    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen types of errors for a broken archive
         raise InputError(f"{where}: cannot be read, it is cut short or no NPZ file ({error}): write it again") from None
 
 
@@ -73,7 +73,7 @@ def _names(archive: zipfile.ZipFile, columns: Mapping[str, Column] | None, where
 
 
 def _column(archive: zipfile.ZipFile, name: str, column: Column | None, where: str) -> AnyArray:
-    """One column: its header first, then as many bytes as that says."""
+    """Read one column: its header first, then as many bytes as the header states."""
     entry = next(entry for entry in archive.infolist() if entry.filename.removesuffix(".npy") == name)
     with archive.open(entry) as stream:
         shape, in_columns, dtype = _header(stream)

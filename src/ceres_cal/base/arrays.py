@@ -1,7 +1,7 @@
-"""Arrays by the kind of their numbers, once for the whole package; what numbers make of a step that fails; inverses of
+"""Types of arrays for the whole package, medians and other statistics, numerical failures as errors, and inverses of
 matrices that may be singular.
 
-Shapes stand in the docstrings.
+Shapes are stated in the docstrings.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from ceres_cal.base.errors import SolutionError
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
-"""Grey pictures at work, and maps of pixels."""
+"""Grey pictures during processing, and maps of pixels."""
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 """Row numbers, and where each of several runs of rows begins."""
 Indices32 = NDArray[np.int32]
-"""The same in columns with a row for each observation, as files and kernels have them."""
+"""Row numbers in columns with a row for each observation, as in files and kernels."""
 Codes = NDArray[np.int8]
-"""One of a few cases: the side of a line, a reason."""
+"""Codes of a few cases: the side of a line, a reason."""
 Image = NDArray[Any]
-"""A photograph as read, of any depth."""
+"""A photograph as read, of any bit depth."""
 Image8 = NDArray[np.uint8]
 AnyArray = NDArray[Any]
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -38,40 +38,40 @@ _Kind = TypeVar("_Kind", bound=np.generic)
 
 
 def distinct(values: NDArray[_Kind], axis: int | None = None) -> NDArray[_Kind]:
-    """The different values in an array, in order; or the different rows along an axis."""
+    """The distinct values of an array, ascending; or its distinct rows along an axis."""
     return np.asarray(np.unique(values, return_counts=True, axis=axis)[0])
 
 
 def median(values: AnyArray) -> float:
-    """The middle of some numbers (N,), or between the two in the middle; NaN where one of them is, or none is there."""
+    """Median of some numbers (N,); NaN where one of them is NaN, or there are none."""
     return float(medians(values))
 
 
 def dots(a: Array, b: Array) -> Array:
-    """(...) sums of products along the last axis of (..., N): of few numbers in a tenth of the time of NumPy's sum."""
+    """(...) sums of products along the last axis of (..., N); for short axes in a tenth of the time of NumPy's sum."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def medians_known(values: Array) -> Array:
-    """(...) those of the numbers along the last axis of (..., N) that are not NaN; NaN where none is there."""
+    """(...) medians along the last axis of (..., N) of the numbers that are not NaN; NaN where there are none."""
     ordered, count = np.sort(values, axis=-1), np.sum(~np.isnan(values), axis=-1, keepdims=True)
     middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=-1)
     return np.asarray(np.mean(np.take_along_axis(ordered, middle, axis=-1), axis=-1))
 
 
 def medians(values: AnyArray) -> Array:
-    """(...) those of the numbers along the last axis of (..., N)."""
+    """(...) medians along the last axis of (..., N)."""
     count = values.shape[-1]
     if not count:
         return np.full(values.shape[:-1], np.nan)
     low, high, last = (count - 1) // 2, count // 2, count - 1
-    ordered = np.partition(values, (low, high, last), axis=-1)  # NaN is the last
+    ordered = np.partition(values, (low, high, last), axis=-1)  # NaN is sorted last
     largest = ordered[..., last]
     return np.asarray(np.where(np.isnan(largest), largest, 0.5 * (ordered[..., low] + ordered[..., high])))
 
 
 def quantile(values: AnyArray, share: float) -> float:
-    """What a share of some numbers (N,), none of them NaN, are below: between two of them in proportion."""
+    """Quantile of some numbers (N,), none of them NaN, with linear interpolation between two of them."""
     last = len(values) - 1
     if last < 0:
         return np.nan
@@ -94,39 +94,39 @@ def largest(values: Array, nothing: float = np.nan) -> float:
 
 
 def rms_and_largest(off: Array) -> tuple[float, float]:
-    """Of lengths; infinite where one is unknown, or none is there."""
+    """Root mean square and maximum of lengths; infinite where one is not finite, or there are none."""
     off = np.where(np.isfinite(off), off, np.inf)
     return rms(off, np.inf), largest(off, np.inf)
 
 
 def grid_places(x: Array, y: Array) -> Array:
-    """(Y * X, 2) all places of a grid x (X,), y (Y,), row by row."""
+    """(Y * X, 2) all places of a grid with x (X,) and y (Y,), row by row."""
     return np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
 
 
 def is_diagonal(matrix: Array) -> bool:
-    """Whether all but the diagonal of a matrix (n, n) is nought."""
+    """Whether all elements of a matrix (n, n) off the diagonal are 0."""
     return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
 
 
 def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable] | None = None) -> Indices:
-    """Which of the known names each one is; without these, of their own in the order in which they appear."""
+    """Index of each name among the known names; without these, among the names in order of first appearance."""
     every = list(names)
     order = {name: number for number, name in enumerate(dict.fromkeys(every) if known is None else known)}
     return np.array([order[name] for name in every], dtype=np.int64)
 
 
 def evenly(count: int, most: int) -> Indices:
-    """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
+    """At most `most` evenly spaced numbers from 0 to count - 1, including both ends."""
     return np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64)
 
 
 @contextmanager
 def numerical(step: str) -> Iterator[None]:
-    """While it lasts, and as a decorator: what fails on its numbers is a SolutionError that names the step.
+    """Context and decorator in which a numerical failure becomes a SolutionError that names the step.
 
-    NumPy's own warnings say nothing that a user could act on: what comes of a NaN or an infinity is judged where the
-    answer is (a failed factorisation here, a failed solve, an unknown number), not where it first appears.
+    NumPy's own warnings are silenced, since a user could not act on them: a NaN or an infinity is judged in the result
+    (a failed factorisation here, a failed solve, an unknown number), not where it first appears.
     """
     with np.errstate(all="ignore"):
         try:
@@ -140,13 +140,14 @@ def numerical(step: str) -> Iterator[None]:
 # ---- covariances where some directions may be unknown ---------------------------------------------------------------
 
 
-# A covariance does not exist where nothing is known. Here the finite part and the unknown directions are kept apart, so
-# that a number which does not depend on an unknown direction keeps its honest, finite sigma and one which does gets
-# infinity: never 0, never a large number that is rounding alone.
+# A covariance does not exist where nothing is known. Here the finite part and the unknown directions are kept apart: a
+# number that does not depend on an unknown direction keeps its finite sigma, and one that does gets infinity. It never
+# gets 0, nor a large number that is only rounding.
 
 NOTHING = 2e-14
-"""Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
-1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
+"""Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown. Rounding reaches
+1e-15 for each ten numbers, and a sigma millions of times larger than each number would have alone counts as infinite.
+"""
 
 
 def _nothing(count: int) -> float:
@@ -154,11 +155,11 @@ def _nothing(count: int) -> float:
 
 
 def _scaled(information: Array, limits: Array) -> tuple[Array, Array]:
-    """Scale (..., n) that makes the diagonal one, and the information (..., n, n) in it."""
+    """Return the scale (..., n) that makes the diagonal one, and the information (..., n, n) scaled by it."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     known = diagonal > limits**-2.0
     scale = np.where(known, 1.0 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
-    # What is not known at all has rounding on its diagonal, which must not be scaled up.
+    # A number that is not known at all has rounding on its diagonal, which must not be scaled up.
     information = np.where(known[..., :, None] & known[..., None, :], information, 0.0)
     return scale, information * scale[..., :, None] * scale[..., None, :]
 
@@ -181,26 +182,28 @@ def known_inverses(information: Array, limits: Array) -> Array:
 
 
 def are_known(information: Array, limits: Array) -> bool:
-    """Whether nothing is unknown in any of many matrices (S, n, n), at a glance; False where it takes a closer look."""
+    """Whether no direction is unknown in any of many matrices (S, n, n), by a fast test; False where that cannot
+    decide.
+    """
     return _regular_inverses(_scaled(information, limits)[1]) is not None
 
 
 def _regular_inverses(scaled: Array) -> Array | None:
-    """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
+    """Plain inverses, which are ten times as fast; None where a direction of any matrix is nearly unknown."""
     inverse = _unless_singular(inverse_of, scaled)
     if inverse is None:
         return None
-    sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
-    most = 1e8  # the inverse of an eigenvalue near to being unknown; plain inverses are good to 1e-7 there
+    sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # at least 1 for a unit diagonal, except for rounding
+    most = 1e8  # inverse of an eigenvalue that is nearly unknown; plain inverses are accurate to 1e-7 there
     regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < most)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
 
 
-_AT_ONCE = 48  # rows of a matrix up to which LAPACK's own inverse takes less time than one by halves
+_AT_ONCE = 48  # number of rows up to which LAPACK's own inverse is faster than one by halves
 
 
 def inverse_of(matrix: Array) -> Array:
-    """The inverse (..., n, n) of symmetric matrices whose eigenvalues are positive."""
+    """Inverses (..., n, n) of symmetric matrices with positive eigenvalues."""
     if matrix.shape[-1] <= _AT_ONCE:
         return np.asarray(np.linalg.inv(matrix))
     root = inverse_root_of(matrix)
@@ -208,7 +211,7 @@ def inverse_of(matrix: Array) -> Array:
 
 
 def inverse_root_of(matrix: Array) -> Array:
-    """Lower triangles W (..., n, n); W^T W are these inverses. Takes a third of the time of LAPACK's inverse."""
+    """Lower triangles W (..., n, n) for which W^T W are the inverses, in a third of the time of LAPACK's inverse."""
     if matrix.shape[-1] <= _AT_ONCE:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(matrix)))
     root, half = np.zeros_like(matrix), matrix.shape[-1] // 2
@@ -221,9 +224,9 @@ def inverse_root_of(matrix: Array) -> Array:
 
 
 def root_of(matrix: Array) -> Array:
-    """(n, n) root with root^T root = matrix, which is symmetric and has no negative eigenvalue but by rounding."""
+    """(n, n) root with root^T root = matrix; the matrix is symmetric and positive semidefinite except for rounding."""
     lower = _unless_singular(np.linalg.cholesky, matrix)
-    if lower is not None:  # in a tenth of the time
+    if lower is not None:  # takes a tenth of the time
         return lower.T
     values, vectors = np.linalg.eigh(matrix)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
@@ -237,13 +240,15 @@ def _unless_singular(function: Callable[[Any], Any], matrix: Array) -> Array | N
 
 
 def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array:
-    """(n, n) information about some numbers, the others integrated out: the Schur complement of the whole.
+    """(n, n) information about some numbers with the others integrated out: the Schur complement.
 
     Args:
-        here: (n, n). coupling: (m, n). others: (m, m), their limits (m,) see `Spread.of`.
+        here: (n, n) information about them.
+        coupling: (m, n) between the others and them.
+        others: (m, m) information about the others. limits: (m,) of the others, see `Spread.of`.
     """
-    residue = 1e-11  # what a Schur complement leaves of a direction that is unknown, relative to what went in
-    told = np.flatnonzero(np.diagonal(here) > 0.0)  # of the others nothing is known
+    residue = 1e-11  # what a Schur complement leaves of an unknown direction, relative to the input
+    told = np.flatnonzero(np.diagonal(here) > 0.0)  # nothing is known of the rest
     coupling = coupling[:, told]
     left = here[np.ix_(told, told)] - coupling.T @ known_inverses(others, limits) @ coupling
     scale = np.sqrt(np.diagonal(here)[told])
@@ -255,10 +260,10 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
 
 
 def thin_root(information: Array, sd: Array) -> Array:
-    """(R, n) with root^T root = information (n, n), but for what tells next to nothing of numbers that are known to sd
-    (n,): a Cholesky factor, the row that tells most first.
+    """(R, n) root with root^T root = information (n, n), except for negligible parts: a Cholesky factor whose rows are
+    in descending order of information about numbers that have standard deviations `sd` (n,).
     """
-    negligible = 1e-9  # of what is known of a number
+    negligible = 1e-9  # relative to the information that sd (n,) implies
     left, rows, variances = np.diagonal(information).copy(), np.empty((len(sd), len(sd))), sd**2
     for count in range(len(sd)):
         most = int(np.argmax(left * variances))
@@ -270,7 +275,7 @@ def thin_root(information: Array, sd: Array) -> Array:
 
 
 class Spread(Struct, frozen=True, eq=False):
-    """What is known of n numbers.
+    """Covariance of n numbers, of which some directions may be unknown.
 
     Attributes:
         covariance: (n, n) finite; of the numbers with their unknown directions held.
@@ -284,13 +289,13 @@ class Spread(Struct, frozen=True, eq=False):
 
     @classmethod
     def of(cls, information: Array, limits: Array) -> Spread:
-        """Of an information matrix (n, n), symmetric, not necessarily of full rank.
+        """Make the spread of an information matrix (n, n), which is symmetric and may be singular.
 
         Args:
-            limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
+            limits: (n,) largest sigmas: a number whose sigma would be larger even if all others were known is unknown.
         """
         scale, scaled = _scaled(np.asarray(information, dtype=float), limits)
-        # A file has the lower triangle, and says the same to the last digit.
+        # A file holds the lower triangle only, so that only this is used: results agree to the last digit.
         inverse = _regular_inverses(np.tril(scaled) + np.tril(scaled, -1).T)
         if inverse is not None:
             return cls(inverse * scale[:, None] * scale, np.empty((len(scale), 0)), scale)
@@ -304,14 +309,14 @@ class Spread(Struct, frozen=True, eq=False):
         if not self.unknown.shape[1]:
             return np.zeros(jacobian.shape[:-1], dtype=bool)
         size = np.linalg.norm(jacobian * self.scale, axis=-1)
-        # What leaks through below the root adds no more than the sigma that the function has with all else known.
+        # A dependence below the root adds at most the sigma that the function has if all else is known.
         return np.asarray(np.linalg.norm(jacobian @ self.unknown, axis=-1) > np.sqrt(_nothing(len(self.scale))) * size)
 
     def through(self, jacobian: Array) -> Array:
-        """Covariances (..., m, m) of functions with derivatives (..., m, n); infinite variance where they depend on an
-        unknown direction, NaN as their covariance with others.
+        """Covariances (..., m, m) of functions with derivatives (..., m, n). Functions that depend on an unknown
+        direction have infinite variance, and NaN as their covariance with others.
         """
-        # In one product of matrices: many of a few rows each take up to four times as long.
+        # One product of matrices: many products of a few rows each take up to four times as long.
         along = np.tensordot(jacobian, self.covariance, axes=1)
         return self._marked(along @ np.swapaxes(jacobian, -1, -2), self.depends(jacobian))
 
@@ -327,7 +332,7 @@ class Spread(Struct, frozen=True, eq=False):
 
     @property
     def matrix(self) -> Array:
-        """(n, n) covariance of the numbers themselves, with infinity and NaN as `through` gives them."""
+        """(n, n) covariance of the numbers themselves, with infinity and NaN as in `through`."""
         return self._marked(self.covariance, self.depends(np.eye(len(self.scale))))
 
     @property

@@ -1,7 +1,6 @@
-"""What can go wrong, as errors whose text is written for people: one line, what is wrong, what to do.
+"""Errors, whose text is written for users: one line that says what is wrong and what to do.
 
-And what long work says as it goes: how far it is, and which files are in their place, which is said when it is
-interrupted.
+Also what long work reports: its progress, and which files have been written, which is stated when it is interrupted.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ _P = ParamSpec("_P")
 
 
 class CalibrationError(Exception):
-    """Base of every failure of the package. `str(error)` is one line; `exit_code` is what the commands exit with.
+    """Base of every failure of the package. `str(error)` is one line; `exit_code` is the exit code of the commands.
 
     Attributes:
-        camera: whose observations it comes from, where others may do without it.
+        camera: the camera whose observations caused it, if others are not affected.
     """
 
     exit_code = 2
@@ -63,7 +62,7 @@ class SolutionError(CalibrationError):
 
 @contextmanager
 def naming(where: object) -> Iterator[None]:
-    """Put `where`, a file or a place in one, before the line of an InputError that does not begin with it."""
+    """Prefix an InputError with `where`, a file or a place in one, unless it begins with that already."""
     try:
         yield
     except InputError as error:
@@ -73,7 +72,7 @@ def naming(where: object) -> Iterator[None]:
 
 
 def attempt(work: Callable[[], _T], expected: type[CalibrationError] = CalibrationError) -> _T | CalibrationError:
-    """What work returns, or the failure that it ended with, as a value; a comment there says what the user reads."""
+    """Return the result of `work`, or the failure that it raised as a value; a comment there says what users read."""
     try:
         return work()
     except expected as error:  # quiet: whoever attempts it says what follows
@@ -81,7 +80,7 @@ def attempt(work: Callable[[], _T], expected: type[CalibrationError] = Calibrati
 
 
 def or_none(function: Callable[_P, _T | None]) -> Callable[_P, _T | None]:
-    """A function whose failure is the answer None; a comment beside it says what the user reads."""
+    """Make a function return None where it fails; a comment beside it says what the user reads."""
 
     @wraps(function)
     def answer(*args: _P.args, **kwargs: _P.kwargs) -> _T | None:
@@ -92,7 +91,9 @@ def or_none(function: Callable[_P, _T | None]) -> Callable[_P, _T | None]:
 
 
 def answer_or_reason(work: Callable[[], _T]) -> tuple[_T | None, str]:
-    """What work returns, or None and the line that says why there is nothing; for whoever goes on after any failure."""
+    """Return the result of `work` and "", or None and one line with the reason; for callers that continue after any
+    failure.
+    """
     try:
         return work(), ""
     except Exception as error:  # reads: "field.json: cannot be written: ..." on the page
@@ -103,14 +104,14 @@ def answer_or_reason(work: Callable[[], _T]) -> tuple[_T | None, str]:
 StepProgress = Callable[[int, int, str], None]
 """Called after each step with (steps done, steps in all, what was done)."""
 ImageProgress = StepProgress
-"""Steps are images, named by their files."""
+"""Progress over images, which are named by their files."""
 
 _noted: ContextVar[list[str] | None] = ContextVar("noted", default=None)
 
 
 @contextmanager
 def noting() -> Iterator[list[str]]:
-    """The files that are written while it lasts, as they come."""
+    """Yield a list to which files are added as they are written within the context."""
     files: list[str] = []
     token = _noted.set(files)
     try:
@@ -120,13 +121,13 @@ def noting() -> Iterator[list[str]]:
 
 
 def note(path: object) -> None:
-    """That a file is in its place."""
+    """Record that a file has been written."""
     files = _noted.get()
     if files is not None:
         files.append(str(path))
 
 
 def noted_words() -> str:
-    """Which files are in their place, as the end of a message."""
+    """List the files that have been written, as the end of a message."""
     files = _noted.get()
     return f"written were {first_of(files)}" if files else "nothing was written"

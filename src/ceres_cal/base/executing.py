@@ -1,4 +1,4 @@
-"""The same work over many items, here or over any `concurrent.futures.Executor`: the same numbers, whatever it is."""
+"""The same work on many items, in this process or by any `concurrent.futures.Executor`; results are identical."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _T = TypeVar("_T")
 
 
 def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor | None = None) -> Iterator[_T]:
-    """What a function makes of the items, in their order; one after the other where there is no executor.
+    """Yield function(item) for the items, in their order; one after the other if there is no executor.
 
-    Of processes the function and its arguments have to be picklable: no lambda, nothing defined inside a function.
+    For processes the function and its arguments must be picklable: no lambda, nothing defined inside a function.
     """
     if executor is None:
         return map(function, *items)
@@ -27,14 +27,14 @@ def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor 
 
 
 def _begin(jobs: int) -> None:
-    """What a process does first: it shares the cores, and ends when its parent does, however that ends."""
+    """Initialise a process: it shares the cores, and ends when its parent ends for any reason."""
     share_cores(jobs)
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
 
 
 def _end_with_the_parent() -> None:
-    """The parent alone holds the other end of a pipe, which the system closes with it."""
-    orphaned = 143  # as by SIGTERM; nobody is left to ask
+    """Wait until the parent ends: it alone holds the other end of a pipe, which the system closes with it."""
+    orphaned = 143  # exit code as after SIGTERM; no process is left to read it
     import multiprocessing
 
     parent = multiprocessing.parent_process()
@@ -45,9 +45,10 @@ def _end_with_the_parent() -> None:
 
 @contextmanager
 def processes(jobs: int) -> Iterator[Executor | None]:
-    """So many processes that share the cores among them; None for one: then the work is done here. 0 is one a core.
+    """Context with `jobs` processes that share the cores; None for one job, which runs in this process. 0 is one per
+    core.
 
-    Whatever ends it early (Ctrl-C, SIGTERM, SIGKILL, an error) ends the processes, too.
+    Any early end (Ctrl-C, SIGTERM, SIGKILL, an error) ends the processes, too.
 
     Raises:
         InputError: fewer than 0.
@@ -59,18 +60,18 @@ def processes(jobs: int) -> Iterator[Executor | None]:
     if jobs == 1:
         yield None
         return
-    import multiprocessing  # with what it brings along, for those who ask for processes
+    import multiprocessing  # imported here with all that it imports, only if processes are used
     from concurrent.futures import ProcessPoolExecutor
 
-    fresh = multiprocessing.get_context("spawn")  # a fork has its parent's locks, and none of the threads
+    fresh = multiprocessing.get_context("spawn")  # a forked process has its parent's locks, but none of its threads
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(jobs, fresh, _begin, (jobs,))
     try:
         yield pool
     except BaseException:
         for child in set(multiprocessing.active_children()) - before:
-            while child.is_alive():  # what writes its results does not hear the first time
-                child.terminate()  # what waits fails with them; to cancel it besides makes Python 3.11 complain
+            while child.is_alive():  # a process that writes its results may miss the first signal
+                child.terminate()  # waiting futures fail with the processes; cancelling them makes Python 3.11 complain
                 child.join(asked_again_s)
         raise
     finally:

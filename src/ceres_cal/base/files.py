@@ -1,7 +1,7 @@
-"""Reading and writing files: one guarded door, one line of error that names the file, and never half a file.
+"""Reading and writing of files, in one place: an error is one line that names the file, and no file is half written.
 
-Files come from other people. Only regular ones are read, and what the content would take in memory is estimated from
-its size, headers and marks before any of it is made: more than `most_bytes` is refused.
+Files come from other people. Only regular files are read, and the memory that the content would take is estimated from
+its size, headers and marks before it is allocated: more than `most_bytes` is refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Units = Literal["metres, radians, pixels"]
 PixelOrigin = Literal["centre of the top-left pixel"]
 UNITS: Units = "metres, radians, pixels"
 PIXEL_ORIGIN: PixelOrigin = "centre of the top-left pixel"
-"""What files of ours state, and are refused for where they state anything else."""
+"""Stated by the package's files, which are refused where they state anything else."""
 
 LIMIT = "CERES_CAL_MOST_MB"
 _NOT_MARKS = bytes(set(range(256)) - set(b"{}[]:,"))
@@ -48,8 +48,8 @@ _KINDS = {
     **{"array": "a list", "object": "names with values", "float": "a number", "int": "a whole number"},
     **{"str": "a text", "bool": "true or false", "null": "nothing"},
 }
-"""What msgspec's words for types mean."""
-_MEANING = {  # of fields that may be missing
+"""Plain words for msgspec's names of types."""
+_MEANING = {  # meanings of fields that may be missing
     "format": "what the file holds, such as ceres-cal/observations",
     "version": "of the file's format, 1",
     "targets": "what was observed, by name",
@@ -75,8 +75,8 @@ _MEANING = {  # of fields that may be missing
 
 
 def most_bytes() -> float:
-    """What the content of one file may take in memory: 512 MB, or what CERES_CAL_MOST_MB says."""
-    # 10 million observations in an NPZ file, one million in JSON, a photograph of 500 megapixels in grey
+    """Largest memory for the content of one file: 512 MB, or as CERES_CAL_MOST_MB states."""
+    # enough for 10 million observations in NPZ, one million in JSON, or a grey photograph of 500 megapixels
     most_mb = 512
     text = os.environ.get(LIMIT, str(most_mb))
     if not text.isdecimal() or int(text) < 1:
@@ -85,7 +85,7 @@ def most_bytes() -> float:
 
 
 def require_room(needed: float, where: str) -> None:
-    """Raise InputError, before any of it is made, where content would take more than `most_bytes`."""
+    """Raise InputError, before any memory is allocated, where content would take more than `most_bytes`."""
     if needed > most_bytes():
         raise InputError(
             f"{where}: would take {needed / 1e6:.0f} MB, and a file may take {most_bytes() / 1e6:.0f} MB: "
@@ -97,7 +97,7 @@ def require_room(needed: float, where: str) -> None:
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """The content of a file; text in UTF-16, as Windows writes it, in UTF-8.
+    """Read a file; text in UTF-16, as Windows writes it, is converted to UTF-8.
 
     Raises:
         InputError: it is missing, cannot be read, is no regular file, or is too large.
@@ -120,7 +120,7 @@ def opened(path: str | Path) -> Iterator[IO[bytes]]:
         InputError: it is missing, cannot be read, or is no regular file (reading a pipe or a device may never end).
     """
     try:
-        # Opening a pipe would wait for its writer, but for O_NONBLOCK, which regular files ignore.
+        # O_NONBLOCK keeps the opening of a pipe from waiting for its writer; regular files ignore it.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(handle, "rb") as stream:
             if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -137,7 +137,7 @@ def opened(path: str | Path) -> Iterator[IO[bytes]]:
 
 
 def read_json(path: str | Path, format_name: str, version: int) -> dict[str, Any]:
-    """A JSON file of ours as plain data, its format and version checked, its numbers finite.
+    """Read a JSON file of the package as plain data, with its format and version checked and its numbers finite.
 
     Raises:
         InputError: not JSON, cut short, of another format, or of a version this package does not know.
@@ -148,9 +148,9 @@ def read_json(path: str | Path, format_name: str, version: int) -> dict[str, Any
 
 
 def parse_json(content: bytes, where: str) -> Any:
-    """JSON text as plain data; InputError naming `where` if it is none, too large, or names something twice.
+    """Parse JSON text as plain data; InputError naming `where` if it is invalid, too large, or has a duplicate name.
 
-    NaN and Infinity, as Python's own writer spells them, are let through to the checks that can name their place.
+    NaN and Infinity, as Python's own writer spells them, are accepted here; later checks can name their place.
     """
     if not content.strip():
         raise InputError(f"{where}: not valid JSON (cut short?): it is empty")
@@ -158,7 +158,7 @@ def parse_json(content: bytes, where: str) -> Any:
     try:
         data = json.loads(content.decode("utf-8-sig"), parse_int=_whole)
         if _SURROGATE.search(content):
-            msgspec.json.encode(data)  # half a surrogate pair is no letter that could be written again
+            msgspec.json.encode(data)  # half a surrogate pair could not be written again
     except UnicodeDecodeError as error:
         raise InputError(
             f"{where}: not valid JSON: byte {error.start} is not UTF-8: save it in this encoding"
@@ -170,21 +170,21 @@ def parse_json(content: bytes, where: str) -> Any:
 
 
 def _whole(text: str) -> int | float:
-    """A whole number; one that no machine word holds is none, and the checks behind say whose it is."""
+    """A whole number; as a float if it exceeds a machine word, so that later checks can name its place."""
     return int(text) if len(text) < 19 else float(text)
 
 
-_LONG_WHOLE = re.compile(rb"[:\[,]\s*-?\d{19}")  # which msgspec takes at any length, and plain data as `_whole` does
+_LONG_WHOLE = re.compile(rb"[:\[,]\s*-?\d{19}")  # msgspec accepts any length, plain data as `_whole` does
 
 
 def decode_json(
     content: bytes, kind: type[T], where: str, format_name: str, version: int, *, finite: bool = False
 ) -> T:
-    """JSON text of ours as a typed structure, with a "format" and a "version", several times faster than by plain data,
-    which say where it does not fit.
+    """Decode JSON text of the package, with a "format" and a "version", as a typed structure, several times as fast as
+    by plain data, which say where the text does not fit.
 
     Args:
-        finite: whether its numbers must be, as far as the caller does not say where they are not.
+        finite: whether numbers that are not finite are refused here; else the caller names their place.
 
     Raises:
         InputError: see `read_json`, and `convert`.
@@ -207,16 +207,16 @@ def decode_json(
 
 def _require_few_marks(content: bytes, where: str) -> None:
     is_plain = content.isascii() and b"\\u" not in content
-    bytes_per_letter = 1 if is_plain else 4  # a string takes so much for each letter once one of them is rare
-    bytes_per_mark = 80  # of memory, for what stands between two commas, colons or brackets of JSON
+    bytes_per_letter = 1 if is_plain else 4  # bytes of memory for each letter of a string with any rare letter
+    bytes_per_mark = 80  # bytes of memory for each value between two commas, colons or brackets of JSON
     marks = len(content.translate(None, _NOT_MARKS))
     require_room(bytes_per_letter * len(content) + bytes_per_mark * marks, where)
 
 
 def _require_unique_keys(content: bytes, where: str) -> None:
-    """Raise InputError where an object of valid JSON has a key twice: parsers would quietly take the last one."""
-    plain = content.replace(rb"\\", b"\0").replace(rb"\"", b"\1")  # no control letter stands in valid JSON
-    parts = plain.split(b'"')  # strings at odd numbers, what is between them at even ones
+    """Raise InputError where an object of valid JSON has a key twice, of which parsers silently take the last one."""
+    plain = content.replace(rb"\\", b"\0").replace(rb"\"", b"\1")  # valid JSON contains no control characters
+    parts = plain.split(b'"')  # strings have odd indices, the text between them even ones
     objects: list[set[str]] = []
     for number in range(0, len(parts), 2):
         between = parts[number]
@@ -248,7 +248,7 @@ def _require_finite(value: Any, place: str, where: str) -> None:
 
 
 def check_header(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
-    """The same data once its "format" and "version" are known to be ours; InputError naming `where` otherwise."""
+    """Return the data if its "format" and "version" are as expected; InputError naming `where` otherwise."""
     stated = data.get("format") if isinstance(data, dict) else None
     meant = _HOLDING.get(format_name, format_name)
     if isinstance(stated, str) and stated in _HOLDING and stated != format_name:
@@ -265,7 +265,7 @@ def check_header(data: Any, where: str, format_name: str, version: int) -> dict[
 
 
 def body_of(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
-    """The data without their header, which is checked."""
+    """Return the data without the header, which is checked."""
     checked = check_header(data, where, format_name, version)
     return {name: value for name, value in checked.items() if name not in ("format", "version")}
 
@@ -275,7 +275,7 @@ def _clipped(value: Any) -> str:
 
 
 def convert(data: Any, kind: type[T], where: str) -> T:
-    """Plain data as a typed structure; InputError naming `where` and the place inside it."""
+    """Convert plain data to a typed structure; an InputError names `where` and the place in it."""
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
@@ -283,7 +283,7 @@ def convert(data: Any, kind: type[T], where: str) -> T:
 
 
 def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
-    """What msgspec says, with the place as a path of names, and with what a missing field means."""
+    """Reword msgspec's message, with the place as a path of names and the meaning of a missing field."""
     said, _, path = message.partition(" - at `$")
     names, there = _path(path.rstrip("`"), message, data, kind)
     place = "".join(f"[{name}]" if isinstance(name, int) else f".{name}" for name in names).lstrip(".")
@@ -303,7 +303,7 @@ def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
 
 
 def _meant(name: str, there: Any, kind: type[Any]) -> str:
-    """The field that an unknown one is much like, of the structures that have most of those that stand beside it."""
+    """Return a known field similar to an unknown one, from the structures that share most of the fields beside it."""
     every = msgspec.json.schema_components([kind])[1].values()
     fields = [{*one["properties"]} for one in every if name not in one.get("properties", {name})]
     most = max((len(one & {*there}) for one in fields), default=0)
@@ -311,7 +311,7 @@ def _meant(name: str, there: Any, kind: type[Any]) -> str:
 
 
 def _path(path: str, message: str, data: Any, kind: type[Any]) -> tuple[list[str | int], Any]:
-    """The names on a path of msgspec's, for [...] the one without which all is well, and what stands there."""
+    """Return the names on msgspec's path, with [...] as the key without which the data are valid, and what is there."""
     names: list[str | int] = []
     here: Any = data
     for part in re.findall(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]", path):
@@ -325,7 +325,7 @@ def _path(path: str, message: str, data: Any, kind: type[Any]) -> tuple[list[str
 
 
 def _is_well(data: Any, names: list[str | int], key: str, kind: type[Any], message: str) -> bool:
-    """Whether the data raise another error, or none, with this entry alone at a place."""
+    """Whether the data raise another error, or none, if only this entry is kept at a place."""
 
     def alone(value: Any, rest: list[str | int]) -> Any:
         if not rest:
@@ -347,14 +347,14 @@ def _is_well(data: Any, names: list[str | int], key: str, kind: type[Any], messa
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file beside its place and rename it, so that a crash leaves the old file or the new one, never half.
 
-    A file that is replaced keeps its mode and, as far as the system lets us, its owner; a new one has what the umask
-    leaves. What a killed run left beside the place is removed.
+    A replaced file keeps its mode and, as far as the system allows, its owner; a new one follows the umask. Temporary
+    files of killed runs are removed.
 
     Raises:
-        InputError: the folder is missing or cannot be written, or the file is there and may not be written.
+        InputError: the folder is missing or cannot be written, or the file exists and may not be written.
     """
     try:
-        target = Path(os.path.realpath(path))  # behind a symbolic link, which stays
+        target = Path(os.path.realpath(path))  # the target of a symbolic link, which is kept
         if target.exists() and not target.is_file():
             raise InputError(f"{path}: cannot be written: it is a folder or a device")
         if target.exists() and not os.access(target, os.W_OK):
@@ -372,9 +372,9 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 @contextmanager
 def _beside(target: Path) -> Iterator[tuple[int, Path]]:
-    """A new file beside the target, gone at the end where it was not renamed.
+    """Create a new file beside the target, and remove it at the end if it was not renamed.
 
-    It is locked while somebody writes it: one without a lock was left by a killed run.
+    It is locked while it is written: a file without a lock was left by a killed run.
     """
     start, end = f".{target.name[:150]}.", ".part"
     for entry in os.scandir(target.parent):
@@ -385,7 +385,7 @@ def _beside(target: Path) -> Iterator[tuple[int, Path]]:
         handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         with suppress(OSError):  # quiet: a file system without locks; what a killed run leaves then stays
             fcntl.flock(handle, fcntl.LOCK_EX)
-        if os.fstat(handle).st_nlink:  # or another run took it for stale in between
+        if os.fstat(handle).st_nlink:  # otherwise another run has just removed it as stale
             break
         os.close(handle)
     try:
@@ -419,7 +419,7 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def json_text(data: Any) -> str:
-    """Data as readable JSON. Numbers keep every digit, arrays are lists, and what is infinite or NaN is null."""
+    """Format data as readable JSON. Numbers keep every digit, arrays become lists, infinity and NaN become null."""
     try:
         encoded = msgspec.json.encode(data, enc_hook=_plain)
     except UnicodeEncodeError:  # quiet: a file's name that is no UTF-8 has its bytes spelt out
@@ -428,7 +428,7 @@ def json_text(data: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays and numbers of NumPy's as what they hold."""
+    """Convert NumPy's arrays and numbers to Python's."""
     return value.tolist()
 
 
@@ -441,7 +441,7 @@ def _all_printable(data: Any) -> Any:
 
 
 def make_folder(folder: str | Path) -> Path:
-    """A folder, made where it is missing; InputError where it cannot be."""
+    """Create a folder unless it exists; InputError where that fails."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

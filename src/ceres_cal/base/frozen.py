@@ -1,5 +1,5 @@
-"""Classes of annotated fields that are given once; and what is computed, or imported, when it is first asked for:
-properties, names of a package, rows of tables.
+"""Frozen data classes, and values that are computed or imported when they are first used: properties, names of a
+package, rows of tables.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ceres_cal.base.words import did_you_mean
 
 
 class _Signature:
-    """How a class is made, for people and for programs that ask: worked out when they do."""
+    """Signature of a class's constructor, computed when it is asked for."""
 
     def __get__(self, instance: Any, owner: Any) -> Any:
         from inspect import Parameter, Signature
@@ -37,14 +37,14 @@ class _Signature:
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
 class Frozen:
-    """A dataclass whose instances do not change. They are equal to themselves alone, since they may hold arrays, or by
-    what they hold: `class Size(Frozen, eq=True)`.
+    """A dataclass whose instances do not change. Instances are equal only to themselves, since they may hold arrays, or
+    by their values with `class Size(Frozen, eq=True)`.
 
-    What `dataclass(frozen=True)` writes for each class anew stands here once: a class is made three times as fast, and
-    hundreds are made before a command begins.
+    What `dataclass(frozen=True)` generates for each class is written here once: a class is made three times as fast,
+    and hundreds are made before a command begins.
     """
 
-    if TYPE_CHECKING:  # msgspec reads what is annotated
+    if TYPE_CHECKING:  # msgspec reads annotations
         __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
     else:
         __signature__ = _Signature()
@@ -52,7 +52,7 @@ class Frozen:
     def __init_subclass__(cls, *, eq: bool = False, kw_only: bool = False, **others: Any) -> None:
         super().__init_subclass__(**others)
         dataclass(init=False, repr=False, eq=False, kw_only=kw_only)(cls)
-        cls.__dataclass_fields__ = {one.name: one for one in fields(cls)}  # without what belongs to the class
+        cls.__dataclass_fields__ = {one.name: one for one in fields(cls)}  # without class variables
         if eq:
             cls.__eq__, cls.__hash__ = _are_equal, lambda one: hash(_held(one))  # type: ignore[assignment]
 
@@ -60,7 +60,7 @@ class Frozen:
 
         def __init__(self, *args: Any, **given: Any) -> None:
             every, by_place = _fields_of(type(self))
-            if not given and len(args) == len(every) == len(by_place):  # as most are made, in a third of the time
+            if not given and len(args) == len(every) == len(by_place):  # the usual call, in a third of the time
                 self.__dict__.update(zip(by_place, args, strict=True))
             else:
                 self.__dict__.update(_values(type(self), args, given))
@@ -90,12 +90,12 @@ def _held(one: Any) -> tuple[Any, ...]:
 
 @cache
 def _fields_of(of: Any) -> tuple[list[tuple[str, Field[Any]]], list[str]]:
-    """The fields of a class by name, and the names of those that may be given without."""
+    """Return the fields of a class by name, and the names of those that may be positional."""
     return [(one.name, one) for one in fields(of)], [one.name for one in fields(of) if not one.kw_only]
 
 
 def _values(of: type, args: tuple[Any, ...], given: dict[str, Any]) -> dict[str, Any]:
-    """What each field of a class gets; InputError for a name that is none."""
+    """Return the value of each field of a class; InputError for an unknown name."""
     every, by_place = _fields_of(of)
     values, held = dict(zip(by_place, args, strict=False), **given), {}
     if len(values) < len(args) + len(given):
@@ -120,7 +120,7 @@ _T = TypeVar("_T")
 
 
 def replace(of: _T, /, **changes: Any) -> _T:
-    """`dataclasses.replace`, which does not go through `__init__`: what is the same was given once already."""
+    """Same as `dataclasses.replace`, but without `__init__`: unchanged values were accepted before."""
     fields: Any = of.__dataclass_fields__  # type: ignore[attr-defined] # every dataclass has them
     if not changes.keys() <= fields.keys():
         raise TypeError(f"{type(of).__name__} has no field {', '.join(changes.keys() - fields.keys())}")
@@ -133,13 +133,13 @@ def replace(of: _T, /, **changes: Any) -> _T:
 
 
 class Rows(Frozen):
-    """N rows in columns side by side: arrays, or other rows. A number that stands alone is the same for all of them."""
+    """N rows of parallel columns: arrays, or other rows. A single number is the same for all rows."""
 
     def __len__(self) -> int:
         return len(getattr(self, next(iter(self.__dataclass_fields__))))
 
     def take(self, rows: Any) -> Self:
-        """Some rows only, by their numbers or by a mask."""
+        """Return some of the rows, by their numbers or by a mask."""
         columns = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
         parts = {
             name: column.take(rows) if isinstance(column, Rows) else column[rows]
@@ -153,8 +153,8 @@ _Row = TypeVar("_Row")
 
 
 def names_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package: what its stub `__init__.pyi` imports, names and modules in
-    it, and with * all that a module defines, is loaded when it is first asked for.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package. What its stub `__init__.pyi` imports is loaded when
+    it is first used: names, modules in the package, and with * all that a module defines.
     """
     stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi")
     lines = stub.read_text(encoding="utf-8")
@@ -178,8 +178,8 @@ def names_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]
 
 
 def _defined_in(module: Path) -> Iterator[str]:
-    """The public names that a module defines, by its text: to load it takes longer."""
-    # Lines begin with what is looked for, not by an anchor, which takes twice as long, and most are none at a glance.
+    """Yield the public names that a module defines, from its text, which is faster than importing it."""
+    # Matching from a newline takes half the time of an anchor, and the lookahead rejects most lines at once.
     define = (
         r"\n(?=\w|    c)(?:(?:(?:    )?class|def) (\w+)|(\w+(?:, \w+)*)(?::[^=\n]*)? = "
         r"|from \S+ import \w+ as (\w+)(?=\n))"
@@ -189,8 +189,8 @@ def _defined_in(module: Path) -> Iterator[str]:
 
 
 class LazyTable(UserDict[str, _Row]):
-    """A table by name; of a row that is a text the module of that name, below `package`, holds the row, alone or in a
-    tuple: what is of the kind there, and of that name.
+    """A table by name. If a row is a string, the module of that name below `package` holds the row, alone or in a
+    tuple: the object there of this kind and this name.
     """
 
     def __init__(self, package: str, rows: Mapping[str, _Row | str], kind: type[_Row]) -> None:
@@ -207,7 +207,7 @@ class LazyTable(UserDict[str, _Row]):
         return row
 
 
-if TYPE_CHECKING:  # the same to a type checker
+if TYPE_CHECKING:  # identical for a type checker
     from functools import cached_property as cached_property
 else:
 

@@ -1,4 +1,4 @@
-"""Image files as people name them: single ones, folders, patterns and videos."""
+"""Image files as users name them: single files, folders, patterns and videos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VIDEO_ENDINGS = {".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg"
 
 
 def image_files(given: Images) -> list[Path]:
-    """The files that are named; those of folders, and of patterns, in the order of their names.
+    """Return the named files; those of folders and patterns are sorted by name.
 
     Raises:
         InputError: there is no such file, no image in a folder, or nothing at all.
@@ -59,8 +59,8 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def each_camera(given: Sequence[str]) -> list[Path]:
-    """What there is of each camera: several folders or videos that are given, or those in the one folder that is, where
-    it has no images itself; nothing where all is of one camera.
+    """Return the folder or video of each camera: several that are given, or those in a single given folder that has no
+    images itself; empty if all files are of one camera.
     """
     shown = [Path(name) for name in given]
     if len(shown) > 1:
@@ -75,7 +75,7 @@ def each_camera(given: Sequence[str]) -> list[Path]:
 
 
 def images_and_videos(given: Images) -> tuple[list[Path], list[Path]]:
-    """The images as `image_files` has them, and the videos among what is given."""
+    """Return the images that `image_files` finds, and the videos separately."""
     files = image_files(given)
     videos = [path for path in files if path.suffix.lower() in VIDEO_ENDINGS]
     return [path for path in files if path not in videos], videos

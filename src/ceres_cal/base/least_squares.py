@@ -1,4 +1,4 @@
-"""Small smooth least-squares problems by Levenberg and Marquardt: lens models fitted to each other, without noise."""
+"""Levenberg-Marquardt for small smooth least-squares problems without noise: lens models fitted to each other."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 
-_STEP = 1e-6  # of a number's size, for derivatives
+_STEP = 1e-6  # step for derivatives, relative to a number's size
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a step there is not taken
+@np.errstate(over="ignore", invalid="ignore")  # such a step is rejected
 def least_squares(residuals: Callable[[Array], Array], start: Array, sizes: Array) -> Array:
-    """The numbers (K,) that make the sum of squared residuals least, from a start (K,).
+    """Return the numbers (K,) that minimise the sum of squared residuals, from a start (K,).
 
     Args:
-        residuals: numbers -> (N,), finite at the start; where they are not, the step there is not taken.
-        sizes: (K,) by how much each number changes the residuals about as much as the others do.
+        residuals: numbers -> (N,), finite at the start; a step to where they are not finite is rejected.
+        sizes: (K,) changes of the numbers that change the residuals by similar amounts.
     """
-    rests = 1e-9  # relative fall of the cost below which nothing is left to gain
+    rests = 1e-9  # relative decrease of the cost below which the iteration has converged
     most_steps = 100
     scaled, at = start / sizes, residuals(start)
     cost, damping = float(at @ at), 1e-4
@@ -34,7 +34,7 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, sizes: Arra
         while damping < 1e12:
             curved = normal + damping * np.diag(np.diag(normal) + 1e-300)
             if not (np.all(np.isfinite(curved)) and np.all(np.isfinite(gradient))):
-                return np.asarray(scaled * sizes)  # no way on from here
+                return np.asarray(scaled * sizes)  # no further step is possible
             there = scaled - np.linalg.lstsq(curved, gradient, rcond=None)[0]
             moved = residuals(there * sizes)
             lower = float(moved @ moved)

@@ -1,4 +1,4 @@
-"""How objects show themselves: a few lines in a shell, a table in a notebook, a picture in somebody's Axes."""
+"""Representations of objects: a few lines in a shell, a table in a notebook, a picture in the user's Axes."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import grouped
 
-_MOST_LINES, _MOST_LETTERS = 9, 70  # of a text; and of a value in it
-_PICTURES = "ceres_cal.report"  # far above: it is loaded when somebody draws
+_MOST_LINES, _MOST_LETTERS = 9, 70  # lines of a text; letters of a value in it
+_PICTURES = "ceres_cal.report"  # a higher layer: imported only when something is drawn
 
 Shown = tuple[str, Sequence[tuple[str, ...]]]
-"""A line that says what an object is, and rows on what it holds."""
+"""A line that says what an object is, and rows on its content."""
 
 
 def brief(instance: Any) -> str:
-    """The `__repr__` of an object with large parts: its class, and a line for each of its first fields."""
+    """Return the `__repr__` of an object with large parts: its class, and a line for each of its first fields."""
     every = {name: value for name, value in vars(instance).items() if name[0] != "_"}
     lines = [f"  {name}={_short(value)}" for name, value in list(every.items())[: _MOST_LINES - 1]]
     return "\n".join([f"{type(instance).__name__}(", *lines]) + ")"
@@ -35,7 +35,7 @@ def _short(value: Any) -> str:
 
 
 def text_of(shown: Shown) -> str:
-    """A text of at most ten lines."""
+    """Format as text of at most ten lines."""
     title, rows = shown
     most = len(rows) if len(rows) < _MOST_LINES else _MOST_LINES - 1
     widths = [max(map(len, column)) for column in zip(*rows[:most], strict=True)]
@@ -45,7 +45,7 @@ def text_of(shown: Shown) -> str:
 
 
 def html_of(shown: Shown) -> str:
-    """A table for a notebook; the first column names its row."""
+    """Format as a table for a notebook, with the first column as row headers."""
     from html import escape
 
     title, lines = escape(shown[0]), [[escape(cell) for cell in row] for row in shown[1]]
@@ -55,8 +55,8 @@ def html_of(shown: Shown) -> str:
 
 
 def drawn(picture: str, thing: Any, ax: Any, **how: Any) -> Any:
-    """Draw a picture of the report, "module.function", into the given Axes, or into those that pyplot draws in; returns
-    the Axes.
+    """Draw a picture of the report, "module.function", into the given Axes, or into pyplot's current ones; return the
+    Axes.
 
     Raises:
         InputError: Matplotlib is not installed, or ax is something else.

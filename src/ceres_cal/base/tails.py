@@ -1,7 +1,8 @@
-"""Tails of chi-squared, F and binomial variables, as logarithms also far below the smallest float.
+"""Tails of chi-squared, F and binomial variables, as logarithms, even far below the smallest float.
 
-Without a statistics library (scipy is for the tests only): continued fractions of the incomplete beta and gamma
-functions by Lentz's method (NIST DLMF 8.17.22 and 8.9.2). Arguments broadcast; the answer has their common shape.
+They need no statistics library (scipy is for the tests only): the continued fractions of the incomplete beta and gamma
+functions are evaluated by Lentz's method (NIST DLMF 8.17.22 and 8.9.2). Arguments broadcast; the result has their
+common shape.
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array, Indices
 
 NORMAL_95 = 1.959963984540054
-"""Half width, in standard deviations, of the interval that holds 95 % of a normal variable."""
+"""Half width, in standard deviations, of the interval that contains 95 % of a normal variable."""
 NORMAL_95_ONE_SIDED = 1.645
-"""Standard deviations that 95 % of a normal variable stay below."""
-_FEW, _FAR = 12, 1e3  # degrees of freedom; a value
+"""Upper limit of 95 % of a normal variable, in standard deviations."""
+_FEW, _FAR = 12, 1e3  # largest degrees of freedom, and limit of the value, for the short sum
 _MOST_TERMS = 20_000
 _lgamma = np.vectorize(math.lgamma, otypes=[float])
 
 
 def upper_tail(value: float, degrees: int, freedom: float = math.inf) -> float:
-    """Probability that a chi-squared variable is larger.
+    """Probability that a chi-squared variable is larger than the value.
 
     Args:
-        freedom: spare equations behind the noise that the value was divided by; then it is that of `degrees` times an F
-            variable, as a mean over what the noise may be: good to 2 % down to 1e-3 from 30 on.
+        freedom: degrees of freedom of the noise by which the value was divided. The result is then for `degrees` times
+            an F variable, as a mean over the possible noise: accurate to 2 % down to 1e-3 for 30 or more.
     """
     if degrees < 1 or value <= 0.0:
         return 1.0
@@ -39,7 +40,7 @@ def upper_tail(value: float, degrees: int, freedom: float = math.inf) -> float:
 
 
 def _few(x: Array, degrees: int) -> Array:
-    """The tail (N,) of few degrees in a few terms, a hundred times as fast (NIST DLMF 8.4.8 and 8.4.14)."""
+    """(N,) upper tail for few degrees of freedom by a short sum, a hundred times as fast (DLMF 8.4.8 and 8.4.14)."""
     total, term, power = np.zeros_like(x), np.exp(-x), 0.0
     if degrees % 2:
         root = np.sqrt(x)
@@ -51,13 +52,13 @@ def _few(x: Array, degrees: int) -> Array:
 
 
 def quadratic_tail(value: float, variances: Array, squares: Array, freedom: float = math.inf) -> float:
-    """Probability that a sum of squares of D independent normal variables is larger.
+    """Probability that the sum of squares of D independent normal variables is larger than the value.
 
-    A chi-squared variable with the same mean, variance and skewness (Pearson, Biometrika 46, 1959): good to 10 % down
-    to 1e-3.
+    Approximated by a chi-squared variable with the same mean, variance and skewness (Pearson, Biometrika 46, 1959):
+    accurate to 10 % down to 1e-3.
 
     Args:
-        variances, squares: (D,) of each variable, and its squared mean. freedom: see `upper_tail`.
+        variances: (D,) of the variables. squares: (D,) squares of their means. freedom: see `upper_tail`.
     """
     if not len(variances):
         return 1.0
@@ -72,8 +73,8 @@ def quadratic_tail(value: float, variances: Array, squares: Array, freedom: floa
 
 
 def _over_noise(value: float, freedom: float) -> tuple[Array, Array]:
-    """A value at what the noise behind it may be, and the weights of these, after Wilson and Hilferty."""
-    parts, reach = 40, 6.0  # of a mean over a normal variable: steps to either side, and how far in sigmas
+    """Return the value for each possible size of the noise behind it, and their weights, after Wilson and Hilferty."""
+    parts, reach = 40, 6.0  # number of steps to either side, and range in sigmas, of a mean over a normal variable
     if math.isinf(freedom):
         return np.array([value]), np.ones(1)
     spread = 2.0 / (9.0 * max(freedom, 3.0))
@@ -117,13 +118,13 @@ def log_binomial_tail(count: ArrayLike, trials: ArrayLike, probability: ArrayLik
 
 
 def _log_gamma_front(a: Array, x: Array) -> Array:
-    """log(x^a exp(-x) / Gamma(a)), what both tails of the incomplete gamma function begin with."""
+    """log(x^a exp(-x) / Gamma(a)), the common factor of both tails of the incomplete gamma function."""
     return np.asarray(a * np.log(x) - x - _lgamma(a))
 
 
 def _lower_series(a: Array, x: Array) -> Array:
-    """1 / a + x / (a (a + 1)) + ... of the lower tail, DLMF 8.7.1; it converges fast for x up to about a."""
-    least_term = 1e-16  # of a series' sum so far: what comes after is lost in rounding
+    """1 / a + x / (a (a + 1)) + ... for the lower tail, DLMF 8.7.1; it converges fast for x up to about a."""
+    least_term = 1e-16  # relative to the sum so far: later terms are lost in rounding
     one = 1.0 / a
     total = one.copy()
     for n in range(1, _MOST_TERMS):
@@ -135,7 +136,7 @@ def _lower_series(a: Array, x: Array) -> Array:
 
 
 def _upper_fraction(a: Array, x: Array) -> Array:
-    """x + 1 - a - 1 (1 - a) / (x + 3 - a - ...) of the upper tail, DLMF 8.9.2, for x from about a on."""
+    """x + 1 - a - 1 (1 - a) / (x + 3 - a - ...) for the upper tail, DLMF 8.9.2, for x from about a on."""
 
     def term(n: int) -> tuple[Array, Array]:
         return -n * (n - a), x + 2.0 * n + 1.0 - a
@@ -187,12 +188,14 @@ def _lentz(term: Callable[[int], tuple[Array, Array]], first: Array) -> Array:
 
 
 def tail_root(above: Callable[[Array, Indices], Array], low: Array, high: Array, tail: float) -> Array:
-    """(N,) where falling functions are so much, each between two places; `above` gives some of them at a place each.
+    """(N,) roots at which decreasing functions equal `tail`, each bracketed by `low` and `high`; `above` evaluates some
+    of the functions at one place each.
 
     By Chandrupatla's method (Advances in Engineering Software 28, 1997) on their logarithms: inverse quadratic
-    interpolation through three places where that may be trusted, else the middle.
+    interpolation through three places where that is reliable, else bisection.
     """
-    least, exact, most_steps = 1e-12, 1e-7, 40  # of the function; of it and of the interval, as good as its values
+    # least value of the function; tolerance of its logarithm and of the interval, as accurate as its values
+    least, exact, most_steps = 1e-12, 1e-7, 40
     roots, rows = np.full(len(low), np.nan), np.flatnonzero(np.ones(len(low)))
     x, y, width, share = low, high, exact * (high - low), 0.5 * np.ones_like(low)
     a, b = -np.log(tail) * np.ones_like(low), np.log(least / tail) * np.ones_like(low)
@@ -204,7 +207,7 @@ def tail_root(above: Callable[[Array, Indices], Array], low: Array, high: Array,
             break
         rows, (width, place, value, x, y, a, b) = rows[left], (v[left] for v in (width, place, value, x, y, a, b))
         alike = (value > 0.0) == (a > 0.0)
-        z, c = np.where(alike, x, y), np.where(alike, a, b)  # the place that is left
+        z, c = np.where(alike, x, y), np.where(alike, a, b)  # the remaining place
         y, b, x, a = np.where(alike, y, x), np.where(alike, b, a), place, value
         with np.errstate(divide="ignore", invalid="ignore"):
             off, at = (x - y) / (z - y), (a - b) / (c - b)

@@ -1,5 +1,5 @@
-"""Work in parts, a thread each where that pays: the kernels release Python's lock (design, section 3); and what native
-libraries do to the process that loads them, and how long they may keep it.
+"""Work in parts, one per thread where that saves time, since the kernels release Python's lock (design, section 3).
+Also what native libraries do to the process that loads them, and how long they may block it.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _Item = TypeVar("_Item")
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """For the parts that the caller's own thread does not take."""
+    """Thread pool for the parts that the caller's own thread does not process."""
     from concurrent.futures import ThreadPoolExecutor
 
     return ThreadPoolExecutor(thread_name_prefix="ceres_cal")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has the pool, but none of its threads
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked child has the pool, but none of its threads
 
 
 @cache
@@ -55,7 +55,7 @@ def _controller() -> ThreadpoolController:
 
 @contextmanager
 def at_most(threads: int) -> Iterator[None]:
-    """While it lasts this thread's work is cut into so many parts at most; 0 leaves it as it is."""
+    """Context in which this thread's work is split into at most so many parts; 0 does not change the limit."""
     token = _allowed.set(threads or _allowed.get())
     try:
         yield
@@ -64,37 +64,37 @@ def at_most(threads: int) -> Iterator[None]:
 
 
 def share_cores(processes: int) -> None:
-    """From now on this thread takes no more than its share of the cores, and Ctrl-C is for who started the process."""
+    """Limit this thread to its share of the cores from now on, and leave Ctrl-C to the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _allowed.set(max(_cores() // processes, 1))
 
 
 @contextmanager
 def for_small_matrices() -> Iterator[None]:
-    """While it lasts BLAS works in the calling thread alone, in the whole process; freed memory stays at hand.
+    """Context in which BLAS uses only the calling thread, for the whole process, and freed memory is kept.
 
-    OpenBLAS's other threads bring nothing to matrices as small as ours, but spin for milliseconds after each call, on
-    the cores that our own parts need.
+    OpenBLAS's other threads do not speed up matrices as small as these, but spin for milliseconds after each call on
+    the cores that the package's own parts need.
     """
     _keep_freed_memory()
-    has_none = os.environ.get("OPENBLAS_NUM_THREADS") == "1"  # as commands have it; finding BLAS takes 3 ms
+    has_none = os.environ.get("OPENBLAS_NUM_THREADS") == "1"  # set by the commands; finding BLAS takes 3 ms
     with nullcontext() if has_none else _controller().limit(limits=1, user_api="blas"):
         yield
 
 
 def available() -> int:
-    """How many threads may work."""
+    """Number of threads that may be used."""
     return _allowed.get() or _cores()
 
 
 def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
-    """Where each part of so many items begins, and where the last one ends.
+    """Return where each part of `items` items begins, and where the last one ends.
 
     Args:
-        rows: how many they hold in all. row_ns: about how long one of them takes.
+        rows: number of rows in all items. row_ns: approximate time for a row, ns.
     """
-    later_us = 100.0  # that another thread begins after this one
-    worth_us = 400.0  # of work in a part; of half of that a thread brings nothing by the clock, and costs a tenth
+    later_us = 100.0  # delay with which another thread begins
+    worth_us = 400.0  # least work in a part: with half of it a thread saves no elapsed time and costs a tenth more
     work_us = 1e-3 * row_ns * rows
     count = max(1, min(available(), int(work_us / worth_us)))
     ahead = items * later_us / work_us if count > 1 else 0.0
@@ -102,18 +102,20 @@ def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
 
 
 def meanwhile(function: Callable[[], _T]) -> Future[_T]:
-    """What a function returns that another thread calls from now on."""
+    """Call a function in another thread from now on; return the future of its result."""
     return _pool().submit(function)
 
 
 def run_parts(function: Callable[[int, int], _T], parts: Sequence[int]) -> list[_T]:
-    """function(first, last) of every part, at the same time."""
+    """Return function(first, last) for every part; the parts run concurrently."""
     others = [_pool().submit(function, *parts[i : i + 2]) for i in range(1, len(parts) - 1)]
     return [function(*parts[:2]), *(other.result() for other in others)]
 
 
 def in_turn(function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
-    """function(item) of each, in their order; as many at the same time as threads may work, and a few items ahead."""
+    """Yield function(item) for each item, in order; as many run concurrently as threads are available, and a few items
+    ahead.
+    """
     most = available()
     if most == 1:
         yield from map(function, items)
@@ -129,7 +131,7 @@ def in_turn(function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
-    finally:  # what is at work when it is no longer wanted is left to itself
+    finally:  # work in progress that is no longer wanted is not waited for
         own.shutdown(wait=False, cancel_futures=True)
 
 
@@ -138,7 +140,7 @@ _unfinished: list[threading.Thread] = []
 
 @contextmanager
 def kept_signals() -> Iterator[None]:
-    """While a library is loaded that takes SIGTERM (glog prints a stack and aborts): who had the signal keeps it."""
+    """Restore the handler of SIGTERM after loading a library that replaces it (glog prints a stack and aborts)."""
     yield
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -147,12 +149,12 @@ def kept_signals() -> Iterator[None]:
 
 @cache
 def _keep_freed_memory() -> None:
-    """From now on freed memory stays at hand for what comes next, 64 MiB of it, where the C library is glibc.
+    """Make glibc's allocator keep up to 64 MiB of freed memory for reuse from now on; no effect with other C libraries.
 
-    Else arrays are had from the system anew, again and again: a third of the time of sums over many rows in Dask's
-    workers, an eighth of the calibration of a thousand frames.
+    Otherwise arrays are allocated by the system again and again: that takes a third of the time of sums over many rows
+    in Dask's workers, and an eighth of the calibration of a thousand frames.
     """
-    trim, mapped = (-1, 1 << 26), (-3, 1 << 25)  # of glibc's mallopt
+    trim, mapped = (-1, 1 << 26), (-3, 1 << 25)  # parameters and values of glibc's mallopt
     import ctypes
 
     library = ctypes.CDLL(None)
@@ -162,10 +164,11 @@ def _keep_freed_memory() -> None:
 
 
 class _DetachedThread(threading.Thread):
-    """Work that may be left to itself.
+    """Thread that may be abandoned by the one that waits for it.
 
     Attributes:
-        is_left: nobody waits for it any more, so that it writes no file. is_writing: a file, which will be whole.
+        is_left: whether it was abandoned, so that it must write no file.
+        is_writing: whether it is writing a file, which is completed.
     """
 
     is_left = is_writing = False
@@ -173,12 +176,12 @@ class _DetachedThread(threading.Thread):
 
 @contextmanager
 def writing() -> Iterator[None]:
-    """While a file is written; InputError where the thread was left to itself."""
+    """Context for writing a file; InputError if the thread was abandoned."""
     thread = threading.current_thread()
     if not isinstance(thread, _DetachedThread):
         yield
         return
-    thread.is_writing = True  # before it looks, as whoever leaves it says so before waiting
+    thread.is_writing = True  # set before is_left is read: the abandoning thread sets that before it waits
     try:
         if thread.is_left:
             raise InputError("interrupted: not written")
@@ -188,15 +191,15 @@ def writing() -> Iterator[None]:
 
 
 def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) -> _T:
-    """What a function returns whose native work would hold back Ctrl-C until it is done.
+    """Call a function with native work that would otherwise delay Ctrl-C until it is done; return its result.
 
-    It works in a thread of its own, which is left to itself when this one is interrupted or has waited long enough; but
-    for a file that it writes just then, and it writes no other.
+    It runs in a thread of its own, which is abandoned when this one is interrupted or has waited long enough. A file
+    that it is writing at that moment is completed first; it writes no other.
 
     Raises:
         TimeoutError: it takes longer than `timeout_s`.
     """
-    look_s = 0.05  # how often Python looks up from native work, for Ctrl-C
+    look_s = 0.05  # interval at which Ctrl-C is noticed during native work, s
     results: list[tuple[Any, BaseException | None]] = []
 
     def work() -> None:
@@ -205,7 +208,8 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
         except BaseException as error:  # quiet: raised again in the thread that waits
             results.append((None, error))
 
-    thread = _DetachedThread(target=copy_context().run, args=(work,), daemon=True)  # and what it writes is noted here
+    # files that it writes are recorded in this context
+    thread = _DetachedThread(target=copy_context().run, args=(work,), daemon=True)
     _unfinished.append(thread)
     thread.start()
     end = None if timeout_s is None else time.monotonic() + timeout_s
@@ -227,7 +231,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
 
 
 def is_busy() -> bool:
-    """Whether native work was left to itself: a process then ends at once, not when that is done, or by an abort of a
-    library whose threads were still at it.
+    """Whether abandoned native work is still running. If so, the process must end at once: it would otherwise wait for
+    it, or be aborted by a library whose threads are still running.
     """
     return bool(_unfinished)

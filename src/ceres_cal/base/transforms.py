@@ -19,7 +19,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.typed import numbers_in
 
-_SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
+_SMALL_ANGLE = 1e-4  # below this angle (rad) the series below are exact to rounding
 
 
 def skew(v: ArrayLike) -> Array:
@@ -29,14 +29,14 @@ def skew(v: ArrayLike) -> Array:
 
 
 def skews(v: Array) -> Array:
-    """(K, 3, 3) of each of many, (K, 3)."""
+    """(K, 3, 3) matrices [v]x of many vectors (K, 3)."""
     zero = np.zeros(len(v))
     x, y, z = v.T
     return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
 
 
 def _with_powers(vector: Array, first: float, second: float) -> Array:
-    """I + first [w]x + second [w]x^2, number by number: arrays of three take several times as long."""
+    """I + first [w]x + second [w]x^2, written out by elements: arrays of three numbers take several times as long."""
     x, y, z = vector.tolist()
     xy, xz, yz = second * x * y, second * x * z, second * y * z
     u, v, w = first * x, first * y, first * z
@@ -61,17 +61,17 @@ def rotation_exp(rotation_vector: ArrayLike) -> Array:
 
 
 def rotation_log(rotation: ArrayLike) -> Array:
-    """Rotation vector (rad, length at most pi) of a rotation matrix, by way of the quaternion: exact up to angle pi."""
+    """Rotation vector (rad, length at most pi) of a rotation matrix, by its quaternion: exact up to the angle pi."""
     *axis, cosine = quaternion(rotation).tolist()
     sine = hypot(*axis)
     return np.array(axis) * (2.0 if sine < 1e-12 else 2.0 * atan2(sine, cosine) / sine)
 
 
 def quaternion(rotation: ArrayLike) -> Array:
-    """(x, y, z, w) of a rotation matrix, of unit length, w not below 0."""
+    """(x, y, z, w) of a rotation matrix, of unit length, with w >= 0."""
     r = np.asarray(rotation, dtype=float).tolist()
     trace = r[0][0] + r[1][1] + r[2][2]
-    # Four times the squared components, w last; dividing by the largest one never loses digits.
+    # Four times the squared components, w last; dividing by the largest one avoids a loss of digits.
     squares = [*(1.0 - trace + 2.0 * r[i][i] for i in range(3)), 1.0 + trace]
     largest = squares.index(max(squares))
     turns = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1], 0.0]  # four times x w, y w and z w
@@ -81,7 +81,7 @@ def quaternion(rotation: ArrayLike) -> Array:
 
 
 def rotation_of(quaternion: ArrayLike) -> Array:
-    """The rotation matrix of (x, y, z, w), of any length but 0."""
+    """Rotation matrix of a quaternion (x, y, z, w) of any length but 0."""
     x, y, z, w = np.asarray(quaternion, dtype=float)
     sine = float(np.sqrt(x * x + y * y + z * z))
     return rotation_exp(np.array([x, y, z]) * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))
@@ -100,10 +100,10 @@ def left_jacobian(rotation_vector: ArrayLike) -> Array:
 
 
 def require_rotation(matrix: ArrayLike, name: str) -> Array:
-    """A 3 x 3 matrix that somebody wrote with six digits or more; InputError where it is no rotation matrix."""
-    rounding = 1e-6  # numbers that somebody copied have six digits or more
+    """Return a 3 x 3 matrix if it is a rotation matrix to six digits; InputError otherwise."""
+    rounding = 1e-6  # copied numbers have six digits or more
     m = np.asarray(matrix, dtype=float)
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers so large are no rotation matrix either
+    with np.errstate(over="ignore", invalid="ignore"):  # such large numbers are no rotation matrix either
         off = float(np.max([*np.abs(m @ m.T - np.eye(3)).flat, abs(np.linalg.det(m) - 1.0)]))
     if not off < rounding:
         raise InputError(
@@ -139,7 +139,7 @@ def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     r = np.asarray(rotation, dtype=float)
     cos_beta = np.hypot(r[0, 0], r[0, 1])
     gamma = np.arctan2(r[0, 1], r[0, 0]) if cos_beta > 1e-15 else 0.0
-    # alpha from the rotation with gamma taken out: near beta = +-pi/2 it then makes up for what gamma has lost.
+    # alpha is computed from the rotation without gamma, so that near beta = +-pi/2 it compensates for gamma's error.
     s, c = np.sin(gamma), np.cos(gamma)
     alpha = np.arctan2(s * r[2, 0] - c * r[2, 1], c * r[1, 1] - s * r[1, 0])
     return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)
@@ -158,7 +158,7 @@ class Pose(Frozen):
 
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
-            value = np.array(numbers_in(getattr(self, name), name), order="C")  # or products round otherwise
+            value = np.array(numbers_in(getattr(self, name), name), order="C")  # otherwise products round differently
             if value.shape != shape:
                 raise InputError(f"{name} must have shape {shape}, not {value.shape}")
             value.setflags(write=False)
@@ -175,7 +175,9 @@ class Pose(Frozen):
 
     @classmethod
     def exp(cls, vector: ArrayLike) -> Pose:
-        """The pose of a 6-vector (rotation vector in rad, translation in metres): the solver's block of a pose."""
+        """Make the pose of a 6-vector (rotation vector in rad, translation in metres), which is the solver's block of a
+        pose.
+        """
         v = np.asarray(vector, dtype=float)
         return cls(rotation_exp(v[:3]), v[3:])
 
@@ -192,19 +194,19 @@ class Pose(Frozen):
 
     @classmethod
     def looking(cls, position: ArrayLike, rotation: ArrayLike) -> Pose:
-        """cam_from_world of a camera at `position` (the paper's t): x_cam = R (x_world - t)."""
+        """Make cam_from_world of a camera at `position` (the paper's t): x_cam = R (x_world - t)."""
         r, place = numbers_in(rotation, "rotation"), numbers_in(position, "position")
         if r.shape != (3, 3) or place.shape != (3,):
             raise InputError(f"position and rotation must have shapes (3,) and (3, 3), not {place.shape} and {r.shape}")
         return cls(r, -r @ place)
 
     def turned(self, turn: ArrayLike) -> Pose:
-        """cam_from_world of the camera turned by a rotation vector about its own axes, where it stands."""
+        """Return cam_from_world of the camera rotated by a rotation vector about its own axes, at the same position."""
         return Pose.looking(self.position, rotation_exp(turn) @ self.rotation)
 
     @cached_property
     def position(self) -> Array:
-        """Where frame b's origin lies in frame a, (3,) metres: of cam_from_world, the camera's position (paper's t)."""
+        """(3,) origin of frame b in frame a, metres; for cam_from_world the camera's position (the paper's t)."""
         position = np.asarray(-self.rotation.T @ self.translation)
         position.setflags(write=False)
         return position
@@ -218,7 +220,7 @@ class Pose(Frozen):
         return Pose(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def transform(self, points: ArrayLike) -> Array:
-        """Points (..., 3) of frame a, in frame b."""
+        """Transform points (..., 3) from frame a to frame b."""
         return np.asarray(np.asarray(points, dtype=float) @ self.rotation.T + self.translation)
 
     def __eq__(self, other: object) -> bool:
@@ -235,14 +237,14 @@ class Pose(Frozen):
 
 
 def chained(first: Array, second: Array) -> Array:
-    """[R t] (S, 3, 4) of c_from_b @ b_from_a, pose by pose; (3, 4) stands for the same one every time."""
+    """(S, 3, 4) [R t] of c_from_b @ b_from_a, pose by pose; an argument (3, 4) is the same for all."""
     turned = first[..., :3] @ second
     turned[..., 3] += first[..., 3]
     return np.asarray(turned)
 
 
 def inverted(poses: Array) -> Array:
-    """[R t] (S, 3, 4) of each pose's inverse."""
+    """(S, 3, 4) [R t] of the inverses of poses."""
     rotations = np.swapaxes(poses[..., :3], -1, -2)
     return np.concatenate([rotations, -rotations @ poses[..., 3:]], axis=-1)
 
@@ -254,7 +256,7 @@ class Poses(Frozen, Mapping[str, Pose]):
     """Poses by name, held as one stack.
 
     Attributes:
-        numbers: name -> place in the stack. stack: (K, 3, 4) as [R t].
+        numbers: name -> index in the stack. stack: (K, 3, 4) as [R t].
     """
 
     numbers: Mapping[str, int]
@@ -268,7 +270,7 @@ class Poses(Frozen, Mapping[str, Pose]):
 
     @classmethod
     def stacked(cls, names: Sequence[str], stack: Array) -> Poses:
-        """The poses of these names, one after the other."""
+        """Make poses from their names and a stack in the same order."""
         return cls({name: number for number, name in enumerate(names)}, stack)
 
     def __getitem__(self, name: str) -> Pose:
@@ -285,18 +287,18 @@ class Poses(Frozen, Mapping[str, Pose]):
         return len(self.numbers)
 
     def of_names(self, names: Sequence[str | None]) -> Array:
-        """(N, 3, 4) the poses of these names, None being the identity."""
+        """(N, 3, 4) poses of these names; None is the identity."""
         if self._are_all(names):
             return self.stack
         every = np.concatenate([self.stack, _IDENTITY])
         return np.asarray(every[[len(self.stack) if name is None else self.numbers[name] for name in names]])
 
     def _are_all(self, names: Sequence[str | None]) -> bool:
-        """Whether these are the names of all, in their order: then nothing is looked up."""
+        """Whether these are the names of all poses in order, so that no look-up is needed."""
         return len(names) == len(self.numbers) and list(self.numbers) == names
 
     def updated(self, names: Sequence[str], stack: Array) -> Poses:
-        """The same poses but for those of these names."""
+        """Return the poses with those of these names replaced."""
         if self._are_all(names):
             return Poses(self.numbers, stack)
         changed = self.stack.copy()

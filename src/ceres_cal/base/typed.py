@@ -1,4 +1,4 @@
-"""Arguments that people give from Python: of the types that are annotated, or one line that names the argument."""
+"""Type checks of arguments given from Python: the annotated types, or an error of one line that names the argument."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ceres_cal.base.words import did_you_mean
 
 P = ParamSpec("P")
 R = TypeVar("R")
-_MOST_LETTERS = 40  # of a wrong value
+_MOST_LETTERS = 40  # letters shown of a wrong value
 _UNIONS: tuple[Any, ...] = (Union, UnionType)
 _PLAIN, _OF_NUMPY = frozenset((str, bool, int, float, NoneType)), (np.ndarray, np.generic)
 _ALIKE: Mapping[Any, tuple[type, ...]] = {
@@ -30,33 +30,34 @@ _ALIKE: Mapping[Any, tuple[type, ...]] = {
     Path: (str, os.PathLike),
     str: (str,),
 }
-"""What is taken for a type; for every other class its own instances are."""
+"""Types accepted for an annotated type; for every other class its own instances."""
 
 
 def take_types(instance: Any) -> None:
-    """Give a new dataclass plain Python values of the annotated types: lists for tuples and NumPy's numbers are taken.
+    """Convert the values of a new dataclass to plain Python values of the annotated types; lists are accepted for
+    tuples, and NumPy's numbers as well.
 
     Raises:
         InputError: a value has another type; the message names the field.
     """
     of, held = type(instance), vars(instance)
     for name, kind, default in _fields(of):  # type: ignore[arg-type] # a class has a hash
-        value = held.get(name, default)  # of a default that a file has not, its class
+        value = held.get(name, default)  # a default that is not stored is an attribute of the class
         if type(value) is not kind and value is not default:
             held[name] = convert(_plain(value), kind, f"{of.__name__}({name}=...)")
 
 
 @cache
 def _fields(of: type) -> list[tuple[str, Any, Any]]:
-    """Name, type and default of each."""
+    """Return name, type and default of each field."""
     return [(name, kind, getattr(of, name, _fields)) for name, kind in get_type_hints(of).items()]
 
 
 def _plain(value: Any) -> Any:
-    """NumPy's numbers and arrays as Python's, also inside of lists and mappings."""
-    if type(value) in _PLAIN:  # which is most of them
+    """Convert NumPy's numbers and arrays to Python's, also within lists and mappings."""
+    if type(value) in _PLAIN:  # most values
         return value
-    if isinstance(value, _OF_NUMPY):  # its text is one of Python's, too, that no file takes
+    if isinstance(value, _OF_NUMPY):  # NumPy's str is a Python str, too, but no file takes it
         return value.tolist()
     if isinstance(value, (list, tuple)):
         return [_plain(entry) for entry in value]
@@ -69,9 +70,9 @@ def _plain(value: Any) -> Any:
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """A public function that raises InputError, naming the argument, for a value of another type than annotated.
+    """Make a public function raise InputError, naming the argument, for a value of another type than annotated.
 
-    Plain classes, unions of them and literals are checked. Arrays are checked where they are read (`rows`).
+    Plain classes, their unions and literals are checked. Arrays are checked where they are read (`rows`).
     """
     signature = inspect.signature(function)
 
@@ -102,7 +103,7 @@ def _meant(given: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 
 @cache
 def _every(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
-    """The alternatives of an argument's annotation."""
+    """Return the alternatives of an argument's annotation."""
     kind = function.__annotations__.get(name, Any)
     if isinstance(kind, str):
         try:
@@ -118,7 +119,7 @@ def _is_plain(kind: Any) -> bool:
 
 
 def _kinds(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
-    """What an argument may be; nothing where that cannot be checked by its type."""
+    """Return the types that an argument may have; empty if it cannot be checked by its type."""
     every = _every(function, name)
     return every if all(map(_is_plain, every)) else ()
 
@@ -131,7 +132,7 @@ def _fits(value: Any, kinds: tuple[Any, ...]) -> bool:
 
 
 def _wrong(name: str, value: Any, kinds: tuple[Any, ...], function: Callable[..., Any], given: dict[str, Any]) -> str:
-    """What is wrong with an argument, and what to give."""
+    """Return what is wrong with an argument, and what to give."""
     expected = [one for one in kinds if one is not NoneType]
     words = " or ".join(
         " or ".join(map(repr, get_args(one))) if get_origin(one) is Literal else _named(one) for one in expected
@@ -157,7 +158,7 @@ def _named(kind: type) -> str:
 
 
 def numbers_in(values: Any, name: str) -> Array:
-    """An array of numbers; InputError naming the argument for anything else."""
+    """Return an array of numbers; InputError naming the argument for anything else."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -165,7 +166,7 @@ def numbers_in(values: Any, name: str) -> Array:
 
 
 def size_in(values: Any, name: str = "image_size") -> tuple[int, int]:
-    """Width and height of an image; InputError naming the argument for anything else."""
+    """Return width and height of an image; InputError naming the argument for anything else."""
     given = numbers_in(values, name)
     if given.shape != (2,) or not all(side >= 1.0 and side.is_integer() for side in given.tolist()):
         raise InputError(f"{name} must be (width, height) in px, two positive whole numbers, not {values!r}")
@@ -173,7 +174,7 @@ def size_in(values: Any, name: str = "image_size") -> tuple[int, int]:
 
 
 def rows(values: Any, columns: int, name: str) -> Array:
-    """An array (N, columns) of numbers; InputError naming the argument for anything else."""
+    """Return an array (N, columns) of numbers; InputError naming the argument for anything else."""
     given = numbers_in(values, name)
     if given.ndim != 2 or given.shape[1] != columns:
         raise InputError(f"{name} must have shape (N, {columns}), not {given.shape}")
