@@ -1,4 +1,4 @@
-"""What is known of every number: information, valleys along phi, other explanations, maps over the field."""
+"""The posterior of every number: information, valleys along phi, other explanations, maps over the field."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -1,7 +1,7 @@
-"""The last step of a calibration: what is known of its numbers, and what to do where phi ran away.
+"""The last step of a calibration: compute the posterior, and replace the estimate where phi diverged.
 
-The posterior with what may be otherwise in it: statements in conflict, groups that may not belong, other minima, and
-other lenses.
+The posterior includes the alternatives: statements in conflict, groups that may be outliers, other minima and other
+lenses.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from ceres_cal.posterior.other_lenses import OtherLenses
 
 
-# Relative sigma of phi above which the quadratic picture is left. Nothing changes from half to double.
+# Relative sigma of phi above which its valley is followed instead of the quadratic model. Nothing changes from half to
+# double.
 _BENT = 0.05
-_MOST_DOUBT = 0.8  # probability of all that may be otherwise, each by itself
+_MOST_DOUBT = 0.8  # upper limit of the summed probabilities of doubtful explanations
 
 
 @numerical("the uncertainty")
@@ -41,20 +42,20 @@ def assess(
     *,
     bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
-    """What is known at the estimate, and the estimate: another one where phi went astray.
+    """Return the estimate and what is known there; the estimate is another one where phi diverged.
 
-    Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
-    than by the true one. Where the least cost lies at a phi that no lens has, or the observations leave phi open on
-    a side as far as lenses go, the node of the valley is taken that fits best with what is usual of lenses; the
-    posterior says that phi is unknown.
+    Nearly frontal views can be fitted slightly better by a camera a hand's breadth above the floor, or in the clouds,
+    than by the true one. Where the least cost is at a phi that no lens has, or where the observations leave phi open on
+    one side as far as lenses go, the node of the valley is taken that fits best with a usual lens; the posterior says
+    that phi is unknown.
 
     Args:
-        reduced: what the problem says at the estimate.
+        reduced: the problem's information at the estimate.
         degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
-        scatter_at: how the data scatter at an estimate, of which the problem says so much.
-        shifts_at: numbers, and shifts by which they scatter besides, at an estimate. Along a valley the profile is as
-            much wider, and what is across it with phi held.
-        bends: whether what bends is asked besides: of where the estimate rests it says nothing.
+        scatter_at: returns how the data scatter at an estimate, given the problem's information there.
+        shifts_at: returns numbers, and shifts by which they scatter additionally, at an estimate. They widen the
+            profile along a valley, and with phi held the components across it.
+        bends: whether curvature along weak directions is evaluated, too; it does not change the estimate.
 
     Raises:
         SolutionError: no possible lens fits.
@@ -65,7 +66,7 @@ def assess(
         by_model = by_scatter.by_model or by_scatter.information
         keys, shifts = ((), ()) if shifts_at is None else shifts_at(there, None)
         known = by_scatter.widened(keys, shifts)
-        if there is found and by_scatter.by_model is not None:  # the best by the model alone
+        if there is found and by_scatter.by_model is not None:  # the minimum by the model with independent errors
             known = known.widened(known.keys, [to_best(by_scatter.information, says)])
         return known if known is by_scatter else replace(known, by_model=by_model)
 
@@ -73,7 +74,7 @@ def assess(
     posterior = known(estimate, reduced)
     width = posterior.half_width
     valleys: dict[str, tuple[Node, ...]] = {}
-    astray = problem  # with phi held of the cameras that went astray, while others are looked at
+    astray = problem  # phi is held for cameras where it diverged, while others are examined
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         camera = estimate.cameras[name]
         if is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
@@ -92,11 +93,12 @@ def assess(
 
 
 def to_best(known: Information, says: ReducedInformation) -> Array:
-    """(K,) how far the best estimate lies from the one found, where observations scatter more than the model says.
+    """(K,) from the estimate to the best one, where observations scatter more than the model says.
 
-    It weighs observations against priors as if errors were independent. With A what the observations say by the model,
-    g how the priors pull, and P what these say, the observations alone have their best at A^-1 g from the estimate. As
-    they say A' at the end, all of it has its best at (A' + P)^-1 (A' A^-1 - 1) g.
+    The estimate weighs observations against priors as if errors were independent. Let A be the observations'
+    information by the model, P the priors' information and g their pull. The observations alone have their minimum at
+    A^-1 g from the estimate. With their final information A', the minimum of everything is at (A' + P)^-1 (A' A^-1 - 1)
+    g.
     """
     priors = says.priors.less(says.built)
     alone, wider = says.shared.less(priors), known.less(priors)
@@ -104,9 +106,10 @@ def to_best(known: Information, says: ReducedInformation) -> Array:
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
-    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say.
+    """Return the posterior with curvature along weak directions; it also widens valleys across, where phi is held.
 
-    How targets lie off their drawings bends nothing, and a board may have a thousand such numbers: they are held.
+    Deviations of targets from their drawings cause no curvature, and a board may have a thousand of them: they are
+    held.
     """
     followed = posterior.followed_phi
     if not estimate.structure.dimensions:
@@ -130,7 +133,7 @@ def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> P
 
 
 def _inflation(posterior: Posterior, camera: str) -> float:
-    """Factor on the variance of the observations along a camera's valley: that of phi by them alone."""
+    """Return the factor on the variance of the observations along a camera's valley: that of phi by them alone."""
     if posterior.by_model is None:
         return 1.0
     spreads = (one.less(posterior.stated).spread for one in (posterior.information, posterior.by_model))
@@ -138,8 +141,8 @@ def _inflation(posterior: Posterior, camera: str) -> float:
 
 
 def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> Mixture:
-    """The valley as seen from the estimate, across it as wide as the data scatter with phi held: by as much as all
-    directions scatter more at the estimate, and beyond that so that the same places do.
+    """Return the valley relative to the estimate, across it as wide as the data scatter with phi held: by the factor
+    that all directions have in common at the estimate, and beyond that such that the same places scatter.
     """
     stated_sd = dict(zip(posterior.keys, posterior.stated_sd.tolist(), strict=True))
     along = profile(camera, nodes, estimate, posterior.half_width, stated_sd)
@@ -155,11 +158,11 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
 def _scattered(
     along: Mixture, camera: str, estimate: Estimate, posterior: Posterior, shifts: Array, factor: float = 1.0
 ) -> Mixture:
-    """A valley across which everything is so many times as wide, and its places scatter as shifts (S, K) of all numbers
-    but phi have them at the estimate.
+    """Return a valley whose variances across are multiplied by a factor, and whose places also scatter as shifts (S, K)
+    of all numbers but phi let them scatter at the estimate.
 
-    Numbers one by one tell nothing of places: the higher a node, the closer position and tilt go together, and the less
-    a coefficient may move.
+    Single numbers do not determine places: the higher a node, the more position and tilt are correlated, and the less a
+    coefficient may vary.
     """
     from ceres_cal.posterior.other_lenses import shifts_along
 
@@ -175,7 +178,7 @@ def _scattered(
 
 
 def _usual(name: str, nodes: Sequence[Node]) -> Estimate:
-    """The node that fits best with what is usual of lenses: a standard deviation is a factor of USUAL_PHI_FACTOR."""
+    """Return the node that fits best with a usual lens: one standard deviation is a factor of USUAL_PHI_FACTOR."""
 
     def cost(node: Node) -> float:
         camera = node.estimate.cameras[name]
@@ -191,15 +194,15 @@ def with_doubts(
     explanations: Sequence[Explanation],
     others: Sequence[Solution],
 ) -> Posterior:
-    """Wider by how far the numbers move with each of them.
+    """Return the posterior with these alternatives as components, by how far the numbers move with each.
 
     Args:
-        explanations: of which the less probable one counts as far as it is probable. others: minima beside the end.
+        explanations: the less probable one counts by its probability. others: further minima.
     """
     estimate = end.estimate
-    disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as any of what contradicts it
+    disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as each statement that contradicts it
     posterior = posterior.with_alternatives(conflicts.keys, conflicts.shifts, [disputed] * len(conflicts.shifts))
-    for doubt in conflicts.doubts:  # of which nothing is known for certain any more
+    for doubt in conflicts.doubts:  # their numbers no longer count as stated
         posterior = replace(posterior, stated=posterior.stated.without(doubt.keys))
         posterior = posterior.with_alternatives(conflicts.keys, [doubt.shift], [doubt.probability])
     doubtful = [one for one in explanations if one.is_doubtful]
@@ -207,20 +210,21 @@ def with_doubts(
     likely = np.array([one.doubt for one in doubtful])
     likely /= max(1.0, likely.sum() / _MOST_DOUBT)
     posterior = posterior.with_alternatives(posterior.keys, shifts, likely.tolist())
-    if posterior.followed:  # a valley that is followed has its other places in it
+    if posterior.followed:  # a followed valley contains its other minima
         return posterior
     known = posterior.by_model or posterior.information
     return posterior.with_alternatives(posterior.keys, *minima_of(others, estimate, known, posterior.half_width))
 
 
 def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:
-    """Wider by what other lenses would say, each as far as it is probable; across a valley along phi at each node."""
+    """Return the posterior with other lenses as components by probability; in a valley along phi at each node."""
     if not lenses.others:
         return posterior
     from ceres_cal.posterior.other_lenses import counted, shifts_to_lenses
 
     followed = posterior.followed_phi
-    # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
+    # A lens says nothing about how targets are built or placed; it was compared with some observations, targets as
+    # drawn.
     keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
     weights = counted(lenses.weights)
     every = (lenses.near, *lenses.others)

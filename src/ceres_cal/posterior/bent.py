@@ -1,14 +1,14 @@
-"""Where the cost is no parabola: along phi, and at the ends of weak directions.
+"""Where the cost is not quadratic: along phi, and at the ends of weak directions.
 
-The views of a flat field from nearly above tell phi by the small differences of large numbers, so the least cost has a
-long, bent valley that no ellipse describes (the profile likelihood). It is followed step by step; at each of its nodes
-the other numbers have a covariance of their own. Together they bound any number or mapped point that depends on both:
-along the valley exactly, across it by the quadratic picture.
+Views of a flat field from nearly above determine phi by small differences of large numbers, so the least cost is a
+long, bent valley that no ellipse describes (the profile likelihood). The valley is followed step by step; at each node
+the other numbers have a covariance of their own. Together the nodes bound any number or mapped point that depends on
+both: exactly along the valley, by the quadratic model across it.
 
-A direction that is known to a few hundredths of its natural size reaches so far that the least cost there is a curve,
-not a line: one board before a lens with tangential terms fits nearly as well with its principal point a quarter of the
-image aside and all coefficients changed along. At both ends of each such direction the rest is solved for anew; what
-the numbers do there makes the posterior a mixture of components along curves through these ends. Nothing is solved
+A direction that is known to a few hundredths of its natural size reaches so far that the least cost along it is a
+curve: one board in front of a lens with tangential terms fits nearly as well with the principal point a quarter of the
+image aside and all coefficients changed accordingly. At both ends of each such direction the other numbers are solved
+for again; the results make the posterior a mixture of components along curves through these ends. Nothing is solved
 where all directions are well known.
 """
 
@@ -26,19 +26,19 @@ from ceres_cal.problem.quantities import PHI_RANGE, difference, moved, natural_s
 from ceres_cal.problem.reduced import information
 from ceres_cal.robust.other_minima import FEW, solved_soon
 
-# Rise of twice the cost at which the valley is followed no further: three sigma, or well beyond the 95 % bound where
-# few degrees of freedom have that farther out. Nothing changes from half to double.
+# Rise of twice the cost beyond which the valley is not followed: three sigma, or well beyond the 95 % bound where few
+# degrees of freedom put that farther out. Nothing changes from half to double.
 _FAR = 9.0
-_STEPS = (0.02, 0.35)  # of log phi
+_STEPS = (0.02, 0.35)  # smallest and largest step of log phi
 
 
 class Node(Frozen):
-    """One point of the valley: phi held, everything else at its best.
+    """One point of the valley: the minimum with phi held.
 
     Attributes:
-        cost: twice the least cost there, that of the observations over the factor on their variance; with that of the
-            priors, also of those on phi.
-        information: about everything shared, phi too, though it was held.
+        cost: twice the least cost there: that of the observations divided by the factor on their variance, plus that of
+            the priors, including those on phi.
+        information: about all shared numbers, including phi, although it was held.
     """
 
     estimate: Estimate
@@ -49,14 +49,15 @@ class Node(Frozen):
 def valley(
     camera: str, problem: Problem, estimate: Estimate, inflation: float = 1.0, half_width: float = NORMAL_95
 ) -> tuple[Node, ...]:
-    """Follow the valley from the estimate both ways, until it is far up or phi is no lens any more.
+    """Follow the valley from the estimate in both directions, until the cost has risen far or phi leaves the range of
+    lenses.
 
     Args:
         half_width: standard deviations from the middle to the end of a 95 % interval.
-        inflation: factor on the variance of the observations along it: what they cost is divided by it.
+        inflation: factor on the variance of the observations along it: their cost is divided by it.
 
     Raises:
-        SolutionError: the solve does not find back to where it ended, or from there to a lens that fits.
+        SolutionError: the solve does not converge at the estimate, or does not lead from there to a lens that fits.
     """
     unit, phi = unit_px(estimate.cameras[camera]), estimate.cameras[camera].phi
     first = least = _node(camera, problem, estimate, inflation)
@@ -83,16 +84,16 @@ def valley(
 def profile(
     camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float, stated_sd: Mapping[Key, float]
 ) -> Mixture:
-    """The valley as seen from the estimate.
+    """Return the valley relative to the estimate.
 
     Args:
         half_width: standard deviations from the middle to the end of a 95 % interval.
-        stated_sd: of numbers that were stated: a node is no nearer, in standard deviations, than any of them has it.
+        stated_sd: of stated numbers: the distance of a node in standard deviations is at least that of each of them.
     """
     costs = np.array([node.cost for node in nodes])
     phi = estimate.cameras[camera].phi
     here = float(np.interp(phi, [node.estimate.cameras[camera].phi for node in nodes], costs))
-    # Where the valley has a second, lower place, both count: the bound reaches as high over either.
+    # Where the valley has a second, lower minimum within the bound, both count: rises are relative to the lower one.
     base = costs.min() if here - costs.min() <= half_width**2 else here
     keys = _keys_of(camera, estimate, nodes[0].information.keys)
     steps = np.array([difference(node.estimate, estimate, keys) for node in nodes])
@@ -105,22 +106,22 @@ def profile(
 
 @or_none  # quiet: a smaller step is tried; a valley without an end stays open
 def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> Node | None:
-    """The least cost with phi held where the start has it; None where the solver does not get there."""
+    """Return the minimum with phi held at its value in the start; None where the solver does not converge."""
     held = problem.holding(camera, 0)
     solution = solve(held, start)
     if solution.failed:
         return None
     there = solution.estimate
     known = information(problem, there).shared
-    # A solve that holds phi leaves out what priors say of it.
+    # A solve that holds phi omits the priors on phi.
     of_held, stated = (sum(prior.cost(there) for prior in one.stated_at(there)) for one in (held, problem))
     return Node(there, (2.0 * solution.cost - of_held) / inflation + stated, known)
 
 
 def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float, far: float) -> Iterator[Node]:
-    """Nodes on one side up to a rise, each found from the one before by a step along the valley's slope."""
+    """Yield nodes on one side up to a rise; each is found from the one before by a step along the valley's slope."""
     most_nodes = 60
-    most_rise = 1.5  # from one node to the next
+    most_rise = 1.5  # of the cost, from one node to the next
     unit = unit_px(first.estimate.cameras[camera])
     low, high = (unit * limit for limit in PHI_RANGE)
     node, step = first, _first_step(camera, first)
@@ -133,7 +134,7 @@ def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation:
         following = _node(camera, problem, _ahead(camera, node, wanted), inflation)
         change = np.inf if following is None else abs(following.cost - node.cost)
         if following is None or (change > most_rise and node.cost - lowest < far / 2.0 and step > _STEPS[0]):
-            step *= 0.5  # too far to find, or to interpolate where the bounds will lie
+            step *= 0.5  # too far to converge, or to interpolate the bounds
             if step < 0.5 * _STEPS[0]:
                 return
             continue
@@ -143,14 +144,14 @@ def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation:
 
 
 def _first_step(camera: str, node: Node) -> float:
-    """Half a standard deviation of log phi by the quadratic picture, within reason."""
+    """Return half a standard deviation of log phi by the quadratic model, within the limits of a step."""
     column = _phi_column(camera, node.information.keys)
     sd = float(np.sqrt(max(node.information.inverse[column, column], 0.0))) or np.inf
     return float(np.clip(0.5 * sd / node.estimate.cameras[camera].phi, *_STEPS))
 
 
 def _ahead(camera: str, node: Node, phi: float) -> Estimate:
-    """The estimate with another phi, and everything shared moved along with it as the normal equations say."""
+    """Return the estimate with another phi, and all shared numbers moved along as the normal equations predict."""
     keys = node.information.keys
     column = _phi_column(camera, keys)
     others = np.delete(np.arange(len(keys)), column)
@@ -166,32 +167,32 @@ def _phi_column(camera: str, keys: tuple[Key, ...]) -> int:
 
 
 def _keys_of(camera: str, estimate: Estimate, keys: tuple[Key, ...]) -> tuple[Key, ...]:
-    """phi, the camera's other numbers, those of its stations."""
+    """Return the keys of phi, of the camera's other numbers, and of its stations."""
     mine = {name for name, station in estimate.stations.items() if station.camera == camera}
     own = [key for key in keys if key.kind == "camera" and key.owner == camera]
     return (*own, *(key for key in keys if key.kind == "station" and key.owner in mine))
 
 
 def _across(information: Information, keys: tuple[Key, ...]) -> Information:
-    """About all of the keys but the first, which is held; what is not among them integrated out."""
+    """Return information about all keys but the first, which is held; numbers that are not keys are integrated out."""
     held = information.given([key for key in information.keys if key != keys[0]])
     return held.marginal(keys[1:])
 
 
-# Sigma in natural sizes from which on a direction is looked at.
+# Standard deviation in natural sizes above which a direction is examined.
 BENDING = 0.01
-_HELD = 0.005  # of a step: how closely its end is held
-_FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
+_HELD = 0.005  # of a step: standard deviation with which its end is held
+_FARTHEST = 4.0  # factor on the distance by normal equations: what is flatter than that is unknown
 
 
 class Ends(Frozen):
-    """What the numbers do at the ends of weak directions.
+    """Where the numbers are at the ends of weak directions.
 
     Attributes:
-        keys: (K). steps: (2 B, K) as far as the quadratic picture has the ends of the 95 % interval along each
-            direction, upper ones first. ends: (2 B, K) where the least cost has risen there as much.
-        half_width: standard deviations that a step is long. information: of the quadratic picture.
-        others: where solves ended that began far out, with what they cost beyond the least.
+        keys: (K). steps: (2 B, K) to the ends of the 95 % interval along each of B directions by the quadratic model,
+            upper ends first. ends: (2 B, K) to where the least cost has risen as much.
+        half_width: length of a step in standard deviations. information: of the quadratic model.
+        others: minima that were found from starts far out, with their cost above the least.
     """
 
     keys: tuple[Key, ...]
@@ -203,22 +204,22 @@ class Ends(Frozen):
 
     @property
     def excesses(self) -> Array:
-        """(2 B, K) by how much the ends are farther off, in standard deviations' worth of half a direction each."""
+        """(2 B, K) how much farther out the ends are than the steps, in sds of half a direction each."""
         return np.asarray((self.ends - self.steps) / (self.half_width * np.sqrt(2.0)))
 
     def beside(self, stated: Information) -> Ends:
-        """With ends no farther than what was stated lets them be."""
+        """Return a copy whose ends are no farther out than the statements allow."""
         if not np.any(stated.matrix):
             return self
         excesses = self.information.beside(stated, self.excesses)
         return replace(self, ends=self.steps + self.half_width * np.sqrt(2.0) * excesses)
 
     def mixture(self, information: Information) -> Mixture:
-        """Components along the curves through the ends, of all directions at once: half of them the mirror images of
-        the others, together as wide as the directions are, less what each is wide by itself.
+        """Return components along the curves through the ends, along all directions at once. Half of them mirror the
+        others; together they are as wide as the directions, minus the width of each component itself.
 
         Args:
-            information: of everything that is shared.
+            information: about all shared numbers.
         """
         within = 0.25  # share of a weak direction's variance that each component along its curve has by itself
         up, down = np.split(self.ends / self.half_width, 2)
@@ -234,7 +235,7 @@ class Ends(Frozen):
 
 
 def _drawn(count: int) -> Array:
-    """(2 H, count) normal variables, uncorrelated and of variance one: H and their mirror images."""
+    """(2 H, count) normal variables, uncorrelated and of unit variance: H draws and their mirror images."""
     least_pairs = 12  # of components
     half = max(least_pairs, 2 * count)
     grid = np.linspace(0.0, 4.0, 401)
@@ -247,11 +248,11 @@ def _drawn(count: int) -> Array:
 
 
 def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """(K, A) directions of some of the keys whose sigma in natural sizes is above BENDING, one sigma long, in the units
-    of the keys.
+    """(K, A) directions of some of the keys whose standard deviation in natural sizes is above BENDING; each is one
+    standard deviation long, in the units of the keys.
 
-    Structure and placements are not looked at, which follow, nor what is not known at all, nor a lens without a
-    formula, which is a sum of what its numbers do.
+    Not included are structure and placements, which follow the others, numbers that are unknown, and a lens without a
+    formula, which is a sum of the effects of its numbers.
     """
     sizes, at = natural_sizes(estimate, keys), information.columns(keys)
     sums = {(name, q) for name, one in estimate.cameras.items() for form in one.lens.roughness for q in form.names}
@@ -265,13 +266,13 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
 def ends_of(
     problem: Problem, estimate: Estimate, information: Information, by_model: Information, half_width: float
 ) -> Ends | None:
-    """What the numbers of the information do at the ends of its weak directions, and, of few observations, where other
-    minima are that fit as well; None where it has no such direction.
+    """Return where the numbers are at the ends of the weak directions of their information and, for few observations,
+    other minima that fit as well; None where there is no weak direction.
 
     Args:
-        problem: whose cost is least at the estimate. information: as the data scatter. by_model: as that cost says.
+        problem: its cost is least at the estimate. information: with the scatter of the data. by_model: by that cost.
     """
-    far_out = 3.0  # times 95 %: where a search for another minimum starts
+    far_out = 3.0  # times the end of the 95 % interval: start of a search for another minimum
     keys, sizes = information.keys, natural_sizes(estimate, information.keys)
     axes = weak_axes(information, estimate, keys)
     if not axes.shape[1]:
@@ -282,7 +283,7 @@ def ends_of(
     for sign in (half_width, -half_width):
         for axis in axes.T:
             slopes = axis / sizes**2 / float(np.sum((axis / sizes) ** 2))
-            # The cost rises as the model has it, which knows the direction better than the data scatter.
+            # The cost rises by the model's information, which is larger than that with the scatter of the data.
             rise = half_width**2 / float(slopes @ by_model.spread.covariance @ slopes)
             along, step = sign * axis, sign * (information.spread.covariance @ slopes) / sizes
             end = _end(problem, estimate, keys, along)
@@ -291,7 +292,7 @@ def ends_of(
             if far is not None:
                 if (other := solved_soon(problem, far.estimate)) is not None:
                     others.append(replace(other, cost=other.cost - 0.5 * least))
-                # Where the cost rises ever less, the interval ends between; far ends by themselves tell nothing.
+                # Where the cost rises ever more slowly, the interval ends between; a far end alone decides nothing.
                 nearer = far_out * _reach(far, least, rise)
                 if nearer > 1.0:
                     found.append(_excess(_end(problem, estimate, keys, nearer * along), step, least, rise, nearer))
@@ -302,7 +303,7 @@ def ends_of(
 
 
 class _End(Frozen):
-    """Where the numbers are (K,), in natural sizes from the estimate, and twice the cost there."""
+    """The end of a direction: the numbers (K,) relative to the estimate, in natural sizes, and twice the cost."""
 
     estimate: Estimate
     off: Array
@@ -311,7 +312,7 @@ class _End(Frozen):
 
 @or_none  # quiet: no camera there; the end counts as far away as any
 def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Array) -> _End | None:
-    """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
+    """Return the minimum where the numbers' part along a step is as long as the step; None where it is not found."""
     sizes = natural_sizes(estimate, keys)
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
     along = np.flatnonzero(row)
@@ -326,16 +327,16 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
 
 
 def _reach(end: _End, least: float, rise: float) -> float:
-    """How many times as far as an end the cost has risen as it should, if it is a parabola up to there."""
+    """Return the factor on the distance of an end at which the cost has the required rise, if it is a parabola."""
     return float(np.clip(np.sqrt(rise / max(end.cost - least, 1e-12)), 1.0 / _FARTHEST, _FARTHEST))
 
 
 def _excess(end: _End | None, step: Array, least: float, rise: float, factor: float = 1.0) -> Array:
-    """(K,) in natural sizes: an end that is so many steps away, brought to where the cost has risen as it should by
-    one, less that.
+    """(K,) in natural sizes: where the cost has risen as required along one step, by an end that is `factor` steps
+    away, minus the step.
     """
     if end is None:
         return (_FARTHEST - 1.0) * step if factor == 1.0 else np.zeros(len(step))
     excess = end.off * _reach(end, least, rise) - step
     along = step / np.linalg.norm(step)
-    return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # that it ends earlier narrows nothing
+    return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # an end that is nearer narrows nothing

@@ -1,6 +1,6 @@
-"""The posterior as calibration files have it: lower triangles, every number exactly.
+"""The posterior in calibration files: lower triangles, with every number exact.
 
-The posterior as calibration files had it before it was a mixture (0.1): valleys along phi, and ends that bend.
+Also its form in files of 0.1, before it was a mixture: valleys along phi, and curved ends of weak directions.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
     """A mixture of normal distributions in a calibration's file: see `Mixture`.
 
     Attributes:
-        weights, steps, at: of each component its probability, its place from the estimate, and which information.
-        information: lower triangles, of keys less those that are held. chains: of each the first component, and the
-            signed roots of those along phi.
+        weights, steps, at: of each component its probability, its position relative to the estimate, and the index of
+            its information.
+        information: lower triangles, for the keys that are not held. chains: of each the first component, and the
+            signed roots of its components along phi.
     """
 
     keys: list[Key]
@@ -45,7 +46,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
 
     @classmethod
     def of(cls, mixture: Mixture) -> MixtureFile:
-        """As a file has it."""
+        """Return the mixture in the form of a file."""
         known = mixture.information[0].keys
         return cls(
             list(mixture.keys),
@@ -62,7 +63,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
         )
 
     def mixture(self, name: str, known: Collection[Key]) -> Mixture:
-        """The mixture; InputError where its numbers do not fit each other, or those known."""
+        """Return the mixture; raise InputError where its numbers do not fit each other or the known keys."""
         where = f"posterior.mixtures.{name}"
         require_keys(self.keys, known, where)
         held = set(self.held)
@@ -82,24 +83,24 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
         valley = self.phi_px, self.open_below, self.open_above
         if any(len(one) not in (2, 3) for one in self.lenses):
             raise InputError(f"{where}.lenses: of each component its lens and the one that is alike: calibrate again")
-        lenses = {one[0]: (one[1], one[2] if one[2:] else 0) for one in self.lenses}  # of pairs: as of before
+        lenses = {one[0]: (one[1], one[2] if one[2:] else 0) for one in self.lenses}  # pairs are in older files
         return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, lenses)
 
 
 class SeenFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Cameras and stations with one lens of several."""
+    """Cameras and stations with one of several lenses."""
 
     cameras: dict[str, CameraFile]
     stations: dict[str, tuple[str, PoseFile]]
 
     @classmethod
     def of(cls, estimate: Estimate) -> SeenFile:
-        """As a file has it."""
+        """Return an estimate in the form of a file."""
         stations = {name: (one.camera, PoseFile.of(one.cam_from_world)) for name, one in estimate.stations.items()}
         return cls({name: CameraFile.of(one) for name, one in estimate.cameras.items()}, stations)
 
     def estimate(self) -> Estimate:
-        """The estimate; InputError where a camera or a pose is none."""
+        """Return the estimate; raise InputError where a camera or a pose is invalid."""
         cameras = {name: one.camera() for name, one in self.cameras.items()}
         stations = {name: Station(camera, pose.pose()) for name, (camera, pose) in self.stations.items()}
         if any(one.camera not in cameras for one in stations.values()):
@@ -118,7 +119,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     """The posterior in a calibration's file; freedom is null where the sigmas were taken as stated.
 
     Attributes:
-        profiles, bends: what files of before have in place of mixtures (`as_mixtures`).
+        profiles, bends: in older files in place of mixtures (`as_mixtures`).
     """
 
     keys: list[Key]
@@ -136,7 +137,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, posterior: Posterior) -> PosteriorFile:
-        """As a file has it."""
+        """Return the posterior in the form of a file."""
         degrees = posterior.degrees_of_freedom
         return cls(
             list(posterior.keys),
@@ -154,7 +155,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def posterior(self, known: Collection[Key]) -> Posterior:
-        """The posterior; InputError where a matrix has the wrong size, or a number is none of those known."""
+        """Return the posterior; raise InputError where a matrix has the wrong size, or where a key is unknown."""
         require_keys(self.keys, known, "posterior.keys")
         for name in self.placements:
             require_keys(pose_keys("placement", name), known, "posterior.placements")
@@ -181,13 +182,13 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
 def require_alike(
     where: str, keys: Sequence[Key], rows: Sequence[Sequence[float]], others: Sequence[Sequence[Any]]
 ) -> None:
-    """Raise InputError where rows are not as long as there are keys, or others not as many."""
+    """Raise InputError where a row is not as long as the keys, or where the others are not as many as the rows."""
     if any(len(row) != len(keys) for row in rows) or any(len(other) != len(rows) for other in others):
         raise InputError(f"{where}: its numbers do not fit each other: calibrate again")
 
 
 def lower_triangle(information: Information) -> list[float]:
-    """Row by row, the diagonal included."""
+    """Return the lower triangle row by row, including the diagonal."""
     return list(information.matrix[_lower_triangle(len(information.keys))].tolist())
 
 
@@ -197,7 +198,7 @@ def _lower_triangle(size: int) -> tuple[Indices, Indices]:
 
 
 def require_keys(keys: Sequence[Key], known: Collection[Key], where: str) -> None:
-    """Raise InputError where a key of a file is there twice, or is none of those known."""
+    """Raise InputError where a file names a key twice, or an unknown key."""
     for key, count in Counter(keys).items():
         if count > 1:
             raise InputError(f"{where} names {key.quantity!r} of {key.whose} twice: calibrate again")
@@ -206,10 +207,10 @@ def require_keys(keys: Sequence[Key], known: Collection[Key], where: str) -> Non
 
 
 def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str) -> Information:
-    """Information about the keys from the lower triangle of its matrix.
+    """Return information about the keys from the lower triangle of its matrix.
 
     Raises:
-        InputError: not as many numbers as it takes.
+        InputError: the triangle has the wrong number of entries.
     """
     needed = len(keys) * (len(keys) + 1) // 2
     if len(triangle) != needed:
@@ -222,7 +223,7 @@ def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str)
 
 
 def as_mixtures(file: PosteriorFile, posterior: Posterior) -> Posterior:
-    """The posterior of a file with what it has in place of mixtures; InputError where numbers do not fit each other."""
+    """Return the posterior of an older file with mixtures; raise InputError where numbers do not fit each other."""
     mixtures, information = dict[str, Mixture](), posterior.information
     for camera, entry in file.profiles.items():
         valley = convert(entry, ProfileFile, f"posterior.profiles.{camera}")
@@ -244,7 +245,7 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
     open_above: bool
 
     def mixture(self, camera: str, known: Collection[Key]) -> Mixture:
-        """The valley along phi of a camera; InputError where its numbers do not fit each other, or those known."""
+        """Return the valley along a camera's phi; raise InputError where numbers do not fit each other or keys."""
         where = f"posterior.profiles.{camera}"
         require_keys(self.keys, known, where)
         if not self.keys or self.keys[0][:3] != ("camera", camera, "phi"):
@@ -259,7 +260,7 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
-    """What leaves the quadratic picture: one end of each weak direction."""
+    """Deviations from the quadratic model: one end of each weak direction."""
 
     keys: list[Key]
     steps: list[list[float]]
@@ -267,7 +268,7 @@ class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
     half_width: float
 
     def mixture(self, information: Information) -> Mixture | None:
-        """Its components; InputError where its numbers do not fit each other, or those that are known."""
+        """Return its components; raise InputError where its numbers do not fit each other or the known keys."""
         require_alike("posterior.bends", self.keys, self.steps, (self.ends,))
         require_alike("posterior.bends", self.keys, self.ends, ())
         require_keys(self.keys, information.keys, "posterior.bends")

@@ -1,12 +1,12 @@
-"""How well a pixel tells a place, in metres at a height, and how well a camera knows its own image, in pixels.
+"""Accuracy of places that pixels show at a height, in metres, and of a camera's own image, in pixels.
 
-They are the calibration's own share: the noise of the pixel that is asked about comes on top, and model error (a lens
-with too few coefficients, a field painted amiss) is not in them.
+Both are the calibration's own share: the noise of the pixel in question comes on top, and model errors (a lens with too
+few coefficients, a field painted off its nominal position) are not included.
 
-A camera that turns by a little shows the same picture with another principal point: of an image what a turn makes good
-is left out, by least squares, each place as far as it is known: a corner that nobody observed tells no turn. What
-remains is the lens's and the focal length's, wherever the camera hangs; what the pose adds is in the maps over the
-field.
+A camera that turns slightly shows the same picture with another principal point. So the best turn is subtracted from an
+image's errors, by least squares with each place weighted by its accuracy: a corner that nobody observed determines no
+turn. What remains is due to the lens and the focal length, whatever the camera's pose; the maps over the field include
+the pose.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ceres_cal.scene.camera import Camera, in_image
 
 
 class PointSpread(Frozen):
-    """What is known of N located points.
+    """Positions of N located points with their uncertainty.
 
     Attributes:
         located: (N, 2) m, by the estimate.
-        low, high: (N, 2) m, 95 % bounds of x and of y, each by itself; infinite where unknown.
-        radius_95_m: (N,) 95 % of the errors are shorter. sd_m: (N,) root mean square length of the error.
+        low, high: (N, 2) m, 95 % bounds of x and of y separately; infinite where unknown.
+        radius_95_m: (N,) radius within which 95 % of the errors lie. sd_m: (N,) root mean square length of the error.
     """
 
     located: Array
@@ -47,10 +47,10 @@ class PointSpread(Frozen):
 
 
 def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tuple[Key, ...]:
-    """Keys of a station and of its camera.
+    """Return the keys of a station and of its camera.
 
     Raises:
-        InputError: no such station, or one that was held, so that where it stands in the world is nobody's guess.
+        InputError: no such station, or one that was held, so that its pose in the world is unknown.
     """
     if not posterior.knows_station(estimate.station_name(station)):
         raise InputError(f"station {station!r} was held as the world: it has no map of a field: observe one with it")
@@ -58,10 +58,10 @@ def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tupl
 
 
 def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels: Array, height_m: float) -> Array:
-    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys; NaN
-    where they are located nowhere.
+    """(N, 2, K) derivatives of the places that pixels (N, 2) show on the plane z = height_m, by each of the keys; NaN
+    where a pixel shows none.
 
-    What a number moves in the picture the place takes back: it moves by the inverse of how places move it.
+    A place moves such that its image stays at the pixel: by the inverse of the image's derivatives by places.
     """
     camera = estimate.camera_at(station)
     located = camera.locate(pixels, height_m)
@@ -82,7 +82,7 @@ def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels:
 def spread_of_points(
     estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float
 ) -> PointSpread:
-    """What is known of the places at a height that pixels (N, 2) show.
+    """Return the places at a height that pixels (N, 2) show, with their uncertainty.
 
     Raises:
         InputError: see `station_keys`.
@@ -95,7 +95,7 @@ def spread_of_points(
 
 
 def located_by(station: str, pixels: Array, height_m: float) -> Functional:
-    """The places at a height that pixels (N, 2) of a station show."""
+    """Return the functional of the places at a height that pixels (N, 2) of a station show."""
     return Functional(
         lambda there: there.camera_at(station).locate(pixels, height_m),
         lambda there, keys: locate_slopes(there, keys, station, pixels, height_m),
@@ -109,7 +109,7 @@ def _plot(self: FieldMap | ImageMap, ax: Any = None) -> Any:
 
 
 class FieldGrid(Frozen):
-    """Places on the field at one height: all x_m (X,) at all y_m (Y,)."""
+    """A grid on the field at one height: all combinations of x_m (X,) and y_m (Y,)."""
 
     height_m: float
     x_m: Array
@@ -126,7 +126,7 @@ class FieldGrid(Frozen):
         return grid_places(self.x_m, self.y_m)
 
     def place_of_largest(self, values: Array) -> tuple[float, float]:
-        """Where values (Y, X) that are not negative are largest, m; NaN is nowhere."""
+        """Return the place of the largest of the non-negative values (Y, X), m; NaN is ignored."""
         x, y = self.places[np.argmax(np.nan_to_num(values, nan=-1.0, posinf=1e300))].tolist()
         return x, y
 
@@ -141,13 +141,13 @@ class ErrorMap(FieldGrid, ABC):
 
     @property
     def mean_mm(self) -> float:
-        """Mean over what the image shows; NaN where it shows nothing."""
+        """Mean over the places that the image shows; NaN where it shows none."""
         visible = self.errors_mm[~np.isnan(self.errors_mm)]
         return float(np.mean(visible)) if len(visible) else np.nan
 
     @property
     def worst_mm(self) -> float:
-        """Largest over what the image shows."""
+        """Largest error over the places that the image shows."""
         return largest(self.errors_mm)
 
 
@@ -166,7 +166,7 @@ class FieldMap(ErrorMap):
 
     @classmethod
     def of_visible(cls, grid: FieldGrid, station: str, visible: Mask, sd_m: Array, radius_95_m: Array) -> FieldMap:
-        """Of a grid's places (Y * X,), of which those that are visible are known so well."""
+        """Return the map over a grid, of whose places (Y * X,) the visible ones have these errors."""
         values = np.full((2, len(visible)), np.nan)
         values[:, visible] = 1e3 * sd_m, 1e3 * radius_95_m
         return cls(grid.height_m, grid.x_m, grid.y_m, station, *values.reshape(2, *grid.shape))
@@ -177,16 +177,16 @@ class FieldMap(ErrorMap):
 
     @property
     def worst_place_m(self) -> tuple[float, float]:
-        """Where that is."""
+        """Place of the largest error."""
         return self.place_of_largest(self.sd_mm)
 
 
 def visible_pixels(estimate: Estimate, station: str, places: Array, height_m: float) -> Array:
-    """Pixels (N, 2) of places (N, 2) m at a height; NaN where the station's image does not show them."""
+    """Return the pixels (N, 2) of places (N, 2) m at a height; NaN where the station's image does not show them."""
     camera = estimate.camera_at(station)
     pixels = camera.project(np.column_stack([places, np.full(len(places), height_m)]))
     inside = in_image(pixels, camera.image_size)
-    # A ray that comes from below the plane is no view of it, and past the rim of the lens there is no way back.
+    # A ray that reaches the plane from below does not show it, and beyond the lens's rim a pixel shows another place.
     back = camera.locate(pixels, height_m)
     with np.errstate(invalid="ignore"):
         inside &= np.linalg.norm(back - places, axis=1) < 1e-6
@@ -194,7 +194,7 @@ def visible_pixels(estimate: Estimate, station: str, places: Array, height_m: fl
 
 
 def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: FieldGrid) -> FieldMap:
-    """The map over a grid.
+    """Return a station's map of accuracy over a grid.
 
     Raises:
         InputError: see `station_keys`.
@@ -206,15 +206,15 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     return FieldMap.of_visible(grid, station, visible, known.sd, known.radius_95)
 
 
-_STEPS = 32  # along the longer side
+_STEPS = 32  # of the grid along the longer side
 
 
 class ImageMap(Frozen):
-    """How well one camera knows its image, over a grid.
+    """Accuracy of one camera's image, over a grid.
 
     Attributes:
-        x_px (X,), y_px (Y,): of the grid. radius_95_px: (Y, X) 95 % of the errors are shorter; infinite where it is not
-            known, NaN past the lens's monotone radius.
+        x_px (X,), y_px (Y,): of the grid. radius_95_px: (Y, X) radius within which 95 % of the errors lie; infinite if
+            unknown, NaN beyond the lens's monotone radius.
     """
 
     camera: str
@@ -225,10 +225,10 @@ class ImageMap(Frozen):
 
 
 class Picture(Frozen):
-    """What a camera shows at N pixels, and how that moves when the camera is another one.
+    """What a camera shows at N pixels, and how that changes with another camera.
 
     Attributes:
-        weights: (N,) of each in the turn that is left out; 0: none is.
+        weights: (N,) of the pixels in the turn that is subtracted; 0: no turn is subtracted.
     """
 
     camera: Camera
@@ -244,28 +244,28 @@ class Picture(Frozen):
         return pixel_slopes(self.camera, self._rays)
 
     def of(self, camera: Camera) -> Picture:
-        """What another one shows at the same pixels."""
+        """Return what another camera shows at the same pixels."""
         camera = camera.at(Pose.identity())
         return self if camera == self.camera else replace(self, camera=camera)
 
     def weighted(self, weights: Array) -> Picture:
-        """The same with other weights."""
+        """Return a copy with other weights."""
         picture = replace(self, weights=weights)
-        vars(picture).update({"_rays": self._rays, "_by": self._by})  # which take long
+        vars(picture).update({"_rays": self._rays, "_by": self._by})  # expensive to compute
         return picture
 
     @property
     def shown(self) -> Mask:
-        """(N,) which pixels the lens has an answer for."""
+        """(N,) whether the lens has a ray for the pixel."""
         return np.isfinite(self._by.turns[:, 0, 0])
 
     @property
     def _turns(self) -> Array:
-        """(2 N, 3) px per rad about the camera's axes; 0 where the lens shows nothing."""
+        """(2 N, 3) px per rad about the camera's axes; 0 where the lens has no ray."""
         return np.nan_to_num(self._by.turns.reshape(-1, 3))
 
     def shift(self, other: Camera) -> Array:
-        """(N, 2) px from where this camera shows its rays to where another one does, turned as well as can be; NaN
+        """(N, 2) px from where this camera shows its rays to where another one shows them, minus the best turn; NaN
         where either shows nothing.
         """
         if other == self.camera:
@@ -275,13 +275,13 @@ class Picture(Frozen):
         return shift - self._turned(np.nan_to_num(shift)[:, :, None], known)[:, :, 0]
 
     def slopes(self, quantities: Sequence[str]) -> Array:
-        """(N, 2, K) px per unit of some intrinsics, turned as well as can be; 0 where the lens shows nothing."""
+        """(N, 2, K) px per unit of some intrinsics, minus the best turn; 0 where the lens shows nothing."""
         names = intrinsic_names(self.camera.lens)
         moving = np.nan_to_num(self._by.intrinsics[:, :, [names.index(name) for name in quantities]])
         return moving - self._turned(moving, self.shown)
 
     def _turned(self, moving: Array, known: Mask) -> Array:
-        """(N, 2, K) how much of (N, 2, K) px a turn makes good."""
+        """(N, 2, K) the part of displacements (N, 2, K) px that a turn explains."""
         turns, weights = self._turns, np.repeat(self.weights * known, 2)[:, None]
         flat, weighted = moving.reshape(len(weights), moving.shape[-1]), weights**2 * turns
         turn = np.linalg.lstsq(weighted.T @ turns, weighted.T @ flat, rcond=None)[0]
@@ -289,19 +289,19 @@ class Picture(Frozen):
 
 
 def image_grid(image_size: tuple[int, int]) -> tuple[Array, Array]:
-    """x (X,) and y (Y,) of a grid over an image, px, from its first pixels to its last."""
+    """Return x (X,) and y (Y,) of a grid over an image, px, from its first pixels to its last."""
     steps = (max(round(_STEPS * side / max(image_size)), 2) for side in image_size)
     x, y = (np.linspace(0.0, side - 1.0, count + 1) for side, count in zip(image_size, steps, strict=True))
     return x, y
 
 
 def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap:
-    """The map over a camera's image.
+    """Return the map of accuracy over a camera's image.
 
     Raises:
         InputError: no such camera.
     """
-    exact_px = 1e-6  # places that are known better tell a turn alike
+    exact_px = 1e-6  # places known better than this have equal weight in the turn
     if camera not in estimate.cameras:
         raise InputError(f"there is no camera {camera!r}: it is one of {', '.join(estimate.cameras)}")
     own = estimate.cameras[camera].at(Pose.identity())
@@ -316,7 +316,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
 
 
 def shown_by(camera: str, picture: Picture) -> Functional:
-    """By how many px a camera shows its rays elsewhere than a picture of it does."""
+    """Return the functional of the px by which a camera shows its rays elsewhere than a picture of it does."""
 
     def slopes(there: Estimate, keys: Sequence[Key]) -> Array:
         own = [key for key in keys if key[:2] == ("camera", camera)]
@@ -325,17 +325,18 @@ def shown_by(camera: str, picture: Picture) -> Functional:
     return Functional(lambda there: picture.shift(there.cameras[camera].at(Pose.identity())), slopes)
 
 
-# ---- anything that is read off an estimate -------------------------------------------------------------------------
+# ---- distributions of functions of an estimate ---------------------------------------------------------------------
 
-# One path for places on the field, pixels, and the seam of two cameras: where each component of the mixture shows it,
-# and how sure it is of that.
+# The same code serves places on the field, pixels, and the seam of two cameras: each component of the mixture gives a
+# value and its covariance.
 
 
 class Functional(Frozen):
-    """Something that is read off an estimate: N pairs of numbers, and how they move.
+    """A function of an estimate: N pairs of numbers, and their derivatives.
 
     Attributes:
-        values: by an estimate, (N, 2); NaN where nothing is shown. slopes: by it and some keys (K), (N, 2, K).
+        values: returns (N, 2) at an estimate; NaN where nothing is shown. slopes: returns (N, 2, K) at an estimate, by
+            some keys (K).
         tells_phi: whether it changes with phi along a valley; places on the floor do not.
     """
 
@@ -345,10 +346,10 @@ class Functional(Frozen):
 
 
 def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: str = "") -> Reading:
-    """What is known of something shown.
+    """Return the distribution of a functional by the posterior.
 
     Args:
-        camera: which alone it depends on; "" where it depends on several.
+        camera: the only camera that it depends on; "" where it depends on several.
     """
     mixture, width = posterior.mixture(camera), posterior.half_width
     values, covariances = _of_components(mixture, estimate, shown, posterior.lenses, width)
@@ -360,11 +361,11 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
 def _of_components(
     mixture: Mixture, estimate: Estimate, shown: Functional, lenses: Sequence[Estimate], width: float
 ) -> tuple[Array, Array]:
-    """(C, N, 2) values from those of the estimate, and (C, N, 2, 2) covariances.
+    """(C, N, 2) values of each component, relative to the estimate's, and (C, N, 2, 2) covariances.
 
-    One that is another lens shows things by as much elsewhere than the component that is alike but for it as the lens
-    does, wherever it shows anything. What changes along a valley changes with a lens's phi, too, which the valley has
-    already: there the numbers follow it.
+    Values with another lens differ from those of the same component with the chosen lens as the lens does, wherever it
+    shows anything. What changes along a valley changes with a lens's phi, too, which the valley already includes: there
+    the numbers of the component are used.
     """
     here, known = shown.values(estimate), dict[int, Array]()
     values = np.full((len(mixture.at), *here.shape), np.nan)
@@ -392,10 +393,10 @@ def _of_components(
 
 
 def _covariance(information: Information, there: Estimate, shown: Functional, width: float) -> Array:
-    """(N, 2, 2) within a component; where it is a node of a valley, with what bends across it.
+    """(N, 2, 2) covariance within a component; at a node of a valley including curvature across it.
 
     Args:
-        width: standard deviations at which that is looked at; 0 for none.
+        width: standard deviations at which curvature is evaluated; 0 for none.
     """
     slopes = shown.slopes(there, information.keys)
     covariance = information.spread.through(slopes)

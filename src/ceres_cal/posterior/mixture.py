@@ -1,7 +1,7 @@
-"""A posterior as a mixture of normal distributions: weight, place and information of each component.
+"""A posterior as a mixture of normal distributions: weight, position and information of each component.
 
-One component is enough where the cost is a parabola and nothing else may be true. Along a valley of phi there is one at
-each node, in the order of phi; what lies between two nodes is interpolated. Curves through the ends of weak directions,
+One component is enough where the cost is quadratic and there is no alternative. Along a valley of phi there is one at
+each node, in the order of phi; between two nodes values are interpolated. Curves through the ends of weak directions,
 other explanations, other minima and other lenses are components, too. Bounds are quantiles of the mixture, standard
 deviations its moments.
 """
@@ -31,27 +31,27 @@ from ceres_cal.kernels import mixture_above, normal_cdf
 from ceres_cal.problem.information import Information, Key, over
 
 FARTHER = 3.0
-"""Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
+"""Standard deviations up to which valleys are followed: where one widens out there, this counts in standard deviations
 and radii, not only what lies within 95 %."""
-# Share of a flat prior on log phi in how the weight lies along a valley; the rest is the signed root of the rise, which
-# is normal whatever the valley is measured in. Where the valley is flat the root says nothing.
+# Share of a flat prior on log phi in the weights along a valley. The rest is by the signed root of the rise, which is
+# normal for any parameter of the valley, but says nothing where the valley is flat.
 _FLAT = 0.1
 _TWICE = (np.log(2.0), np.log(4.0))
-# Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
-# from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
+# Standard deviations across: a number that changes by less over the last factor two of phi is bounded by the data. From
+# straight above 32 % of the intervals are open, 55 % at half, 18 % at double this value; all contain the truth.
 _BOUNDED = 1.0
-# Ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0, 1 of what goes on for ever.
-# Nothing changes from 0.6 to 0.86.
+# Ratio of the changes over two successive factors two of phi: 1/2 for numbers that decrease with phi towards 0, 1 for
+# numbers that change without end. Nothing changes from 0.6 to 0.86.
 _SHRINKING = 0.75
 _REACH = 8.0  # standard deviations beyond which no quantile lies
 
 
 class Chain(NamedTuple):
-    """Components along phi of one camera, in its order.
+    """Components along the phi of one camera, in the order of phi.
 
     Attributes:
-        at: (N,) which components. roots: (N,) signed roots of twice the rise of the cost there: how far up either side
-            of the valley, in standard deviations.
+        at: (N,) indices of the components. roots: (N,) signed roots of twice the rise of the cost there: the height on
+            either side of the valley, in standard deviations.
     """
 
     at: Indices
@@ -59,16 +59,16 @@ class Chain(NamedTuple):
 
 
 class Mixture(Frozen):
-    """What some numbers may be.
+    """The joint distribution of some numbers.
 
     Attributes:
         keys: (K) the numbers, phi first where it was followed. weights: (C,) probabilities.
-        steps: (C, K) from the estimate to the middle of each component.
-        information: (I) about the numbers, one that it has no key of is held. at: (C,) which of these each has.
-        chains: of components along phi. phi_px: by the estimate; 0 where there is no chain.
-        open_below, open_above: the valley does not rise to the 95 % bound as far as lenses go.
-        lenses: of components that are another lens, which one, and the component that is alike but for the lens: their
-            steps are how the numbers follow it.
+        steps: (C, K) from the estimate to the centre of each component.
+        information: (I) about the numbers; keys that it lacks are held. at: (C,) index of each component's information.
+        chains: of components along phi. phi_px: phi of the estimate; 0 where there is no chain.
+        open_below, open_above: whether the valley does not rise to the 95 % bound within the range of lenses.
+        lenses: component with another lens -> that lens, and the component that differs only by the lens: their steps
+            show how the numbers follow it.
     """
 
     keys: tuple[Key, ...]
@@ -84,7 +84,7 @@ class Mixture(Frozen):
 
     @classmethod
     def of_one(cls, information: Information, step: Array | float = 0.0) -> Mixture:
-        """The normal distribution about the estimate, or so far (K,) from it."""
+        """Return a normal distribution centred at the estimate, or so far (K,) from it."""
         steps = np.zeros((1, len(information.keys))) + step
         return cls(information.keys, np.ones(1), steps, (information,), np.zeros(1, dtype=np.int64))
 
@@ -93,7 +93,7 @@ class Mixture(Frozen):
         cls, keys: tuple[Key, ...], phi_px: float, steps: Array, rises: Array, across: Sequence[Information],
         is_open: tuple[bool, bool],
     ) -> Mixture:  # fmt: skip
-        """A valley: at each node twice the rise of the cost, and the information about all keys but phi."""
+        """Return a valley, from twice the rise of the cost and the information about all keys but phi at each node."""
         side = np.where(np.arange(len(steps)) < np.argmin(rises), -1.0, 1.0)
         chain = Chain(np.arange(len(steps)), side * np.sqrt(np.asarray(rises)))
         numbers = np.zeros(len(steps)), np.asarray(steps), tuple(across), chain.at
@@ -104,7 +104,7 @@ class Mixture(Frozen):
 
     @property
     def phi(self) -> Array:
-        """(C,) px, where it was followed."""
+        """(C,) px of each component, where phi was followed."""
         return np.asarray(self.phi_px + self.steps[:, 0])
 
     @property
@@ -114,18 +114,18 @@ class Mixture(Frozen):
 
     @property
     def chosen(self) -> Mixture:
-        """What it is where the chosen lens is the right one."""
+        """The distribution if the chosen lens is the right one."""
         return self.of(~np.isin(np.arange(len(self.weights)), list(self.lenses))) if self.lenses else self
 
     def of(self, own: Mask) -> Mixture:
-        """What it is where one of these of its components (C,) is the right one; lenses are not told apart."""
+        """Return the distribution if one of these components (C,) is right; lenses are no longer distinguished."""
         place, weights = np.cumsum(own) - 1, self.weights[own] / self.weights[own].sum()
         chains = tuple(Chain(place[chain.at], chain.roots) for chain in self.chains if own[chain.at].all())
         numbers = {"weights": weights, "steps": self.steps[own], "at": self.at[own]}
         return replace(self, **numbers, chains=chains, lenses={})
 
     def marginal(self, keys: Sequence[Key]) -> Mixture:
-        """What some of the numbers may be, in their order here."""
+        """Return the distribution of some of the numbers, in their order here."""
         wanted = set(keys)
         at = [number for number, key in enumerate(self.keys) if key in wanted]
         each = tuple(one.marginal([key for key in one.keys if key in wanted]) for one in self.information)
@@ -133,13 +133,13 @@ class Mixture(Frozen):
 
     @cached_property
     def variances(self) -> Array:
-        """(C, K) within each component; 0 of what is held there, infinite where unknown."""
+        """(C, K) within each component; 0 for held numbers, infinite where unknown."""
         return np.array([over(one.spread.sd**2, one.keys, self.keys) for one in self.information])[self.at]
 
     @cached_property
     def sd(self) -> Array:
-        """(K,) root mean squares about the estimate; along a valley no more than its bounds have, which a thin tail
-        beyond them does not move.
+        """(K,) root mean squares about the estimate; along a valley no more than its bounds imply, so that a thin tail
+        beyond these has no effect.
         """
         read = self.refined(self.steps, self.variances)
         if not self.is_followed:
@@ -149,8 +149,8 @@ class Mixture(Frozen):
 
     @property
     def covariance(self) -> Array:
-        """(K, K) second moments about the estimate, of open valleys as far as they were followed; what is unknown in
-        components is left out.
+        """(K, K) second moments about the estimate; open valleys count as far as they were followed, and what is
+        unknown in components is left out.
         """
         every = ((one.keys, one.spread.covariance) for one in self.information)
         within = np.array([over(over(matrix, keys, self.keys).T, keys, self.keys) for keys, matrix in every])
@@ -159,16 +159,16 @@ class Mixture(Frozen):
         return np.asarray(np.tensordot(weights, known, axes=1) + (weights * steps.T) @ steps)
 
     def bounds(self, half_width: float) -> Array:
-        """(K, 2) beyond which, on either side, as much of it lies as of a normal variable beyond so many sigmas."""
+        """(K, 2) bounds outside which, on either side, lies as much as of a normal variable beyond so many sigmas."""
         return np.column_stack(quantiles(*self.refined(self.steps, self.variances), half_width))
 
     def with_information(self, how: Callable[[Information], Information]) -> Mixture:
-        """With other information in each component."""
+        """Return a copy with other information in each component."""
         return replace(self, information=tuple(map(how, self.information)))
 
     def shifted_also(self, weights: Array, shifts: Array, lenses: Sequence[int] = ()) -> Mixture:
-        """With all of it once more for each of the weights (S,), shifted by (S, C, K) or (S, 1, K). Where these are
-        other lenses, their numbers (S,).
+        """Return a mixture that also has a copy of itself for each of the weights (S,), shifted by (S, C, K) or (S, 1,
+        K). For shifts to other lenses, these are the lenses' numbers (S,).
         """
         every, count = [1.0 - weights.sum(), *weights], len(self.weights)
         shown = {
@@ -191,7 +191,7 @@ class Mixture(Frozen):
         return replace(self, weights=of_all, steps=steps, at=at, chains=chains, lenses=shown)
 
     def beside(self, other: Mixture, weight: float) -> Mixture:
-        """With another one of the same numbers, seen from the same estimate, as far as that is probable."""
+        """Return a mixture with another one of the same numbers, from the same estimate, by the other's weight."""
         weights = np.concatenate([(1.0 - weight) * self.weights, weight * other.weights])
         steps, known = np.concatenate([self.steps, other.steps]), (*self.information, *other.information)
         at = np.concatenate([self.at, len(self.information) + other.at])
@@ -199,7 +199,7 @@ class Mixture(Frozen):
         return replace(self, weights=weights, steps=steps, information=known, at=at, chains=chains)
 
     def off_valley(self, shifts: Array) -> Array:
-        """(S, K) of shifts (S, K) what is beside the first chain, phi held: along it they change nothing."""
+        """(S, K) parts of shifts (S, K) off the first chain, with phi held: shifts along it change nothing."""
         steps = self.steps[self.chains[0].at]
         along = np.array([[np.interp(d[0], steps[:, 0], column) for column in steps.T] for d in shifts])
         return np.asarray((shifts - along.reshape(shifts.shape)) * (np.arange(len(self.keys)) > 0))
@@ -207,8 +207,8 @@ class Mixture(Frozen):
     # ---- between the nodes of a valley ------------------------------------------------------------------------------
 
     def refined(self, values: Array, variances: Array) -> tuple[Array, Array, Array]:
-        """Weights (F,), values (F, ...) and variances (F, ...) with those between the nodes of chains, and beyond open
-        ends: infinite where these grow on.
+        """Return weights (F,), values (F, ...) and variances (F, ...), including those between the nodes of chains, and
+        beyond open ends: infinite where values grow without end.
 
         Args:
             values: (C, ...) of the components. variances: (C, ...) as many, or matrices of the last axis.
@@ -223,8 +223,8 @@ class Mixture(Frozen):
         return weights, means, widths
 
     def _along(self, chain: Chain, values: Array, variances: Array) -> Iterator[tuple[Array, Array, Array]]:
-        """Parts of what `refined` gives."""
-        overlap = 0.5  # standard deviation of each interpolated place, of the way to the next: so there are no steps
+        """Yield the parts of `refined` along a chain."""
+        overlap = 0.5  # width of each interpolated place, as a share of the way to the next: avoids steps
         whole = float(self.weights[chain.at].sum())
         weights, between, across = self._between(chain)
         share = whole / weights.sum()
@@ -240,12 +240,12 @@ class Mixture(Frozen):
                 yield share * weights[[end]], self._limit(chain, own, sds, end)[None], widths[[end]]
 
     def _between(self, chain: Chain) -> tuple[Array, Array, Array]:
-        """Weights (F,) of places along the valley, its ends first and last; of which nodes (F, N) each is, and by how
-        much of them (F, N) the next one differs.
+        """Return weights (F,) of places along the valley, its ends first and last; the shares (F, N) of nodes in each;
+        and the differences (F, N) of these shares to the next place.
         """
         fine = 0.25  # standard deviations from one interpolated place to the next; nothing changes from half to double
         roots, log_phi = chain.roots, np.log(self.phi[chain.at])
-        near, each = np.clip(roots, -_REACH, _REACH), np.eye(len(roots))  # farther up nothing weighs
+        near, each = np.clip(roots, -_REACH, _REACH), np.eye(len(roots))  # farther up weights are negligible
         beyond, whole = near - roots, np.where(np.diff(roots) == 0.0, 1.0, np.diff(roots))
         counts = np.maximum(np.ceil(np.abs(np.diff(near)) / fine), 2).astype(int)
         share = (1.0 + np.diff(beyond) / whole) / counts
@@ -260,14 +260,14 @@ class Mixture(Frozen):
         return weights, places, np.pad((each[node + 1] - each[node]) * share[node][:, None], ((1, 1), (0, 0)))
 
     def _limit(self, chain: Chain, values: Array, sds: Array, end: int) -> Array:
-        """Where numbers (N, ...) go beyond an open end: on by a geometric series, each term for another factor two of
-        phi, to infinity where the last two terms do not shrink.
+        """Return the limit of numbers (N, ...) beyond an open end: by a geometric series with a term for each further
+        factor two of phi, infinite where the last two terms do not shrink.
         """
         phi = self.phi[chain.at]
         away = np.abs(np.log(phi / phi[end]))
         order = np.argsort(away)
         flat = values.reshape(len(values), -1)
-        each = np.eye(len(phi))[:, order]  # shares of the nodes serve all numbers: a map has thousands
+        each = np.eye(len(phi))[:, order]  # shares of the nodes are the same for all numbers: a map has thousands
         halves = _mixed(np.array([[np.interp(d, away[order], one) for one in each] for d in _TWICE]), flat)
         last, before = flat[end] - halves[0], halves[0] - halves[1]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -278,7 +278,7 @@ class Mixture(Frozen):
 
 
 def _mixed(between: Array, values: Array) -> Array:
-    """(F, ...) of values (N, ...); infinite where one of them that is looked at is."""
+    """(F, ...) weighted sums of values (N, ...); infinite where a value with a weight is infinite."""
     flat = values.reshape(len(values), -1)
     finite = np.isfinite(flat)
     mixed = between @ np.where(finite, flat, 0.0)
@@ -291,20 +291,20 @@ def _mixed(between: Array, values: Array) -> Array:
 
 
 def moments(weights: Array, means: Array, variances: Array) -> Array:
-    """(...) root mean squares about the estimate, of means and variances (F, ...)."""
+    """(...) root mean squares about the estimate, from means and variances (F, ...)."""
     return np.asarray(np.sqrt(_mixed(weights[None], variances + means**2)[0]))
 
 
 def are_unbounded(weights: Array, means: Array, variances: Array, half_width: float) -> Mask:
-    """(...) of a mixture's means and variances (F, ...), whether either of its `quantiles` is infinite."""
+    """(...) whether either of the `quantiles` is infinite, for a mixture's means and variances (F, ...)."""
     tail = float(normal_cdf(-half_width))
     lost = [0.5 * np.isinf(variances), means == np.inf, means == -np.inf]
     return np.asarray(np.any([np.tensordot(weights, one.astype(float), axes=1) > tail for one in lost], axis=0))
 
 
 def quantiles(weights: Array, means: Array, variances: Array, half_width: float) -> tuple[Array, Array]:
-    """(...) below and above which as much of a mixture lies, of means and variances (F, ...), as of a normal variable
-    beyond so many sigmas. Half of what has no variance lies beyond any place: infinite where that is more.
+    """(...) below and above which as much of a mixture lies, by means and variances (F, ...), as of a normal variable
+    beyond so many sigmas. Components without a variance lie half beyond any place: infinite where that is more.
     """
     nowhere = 0.5 * np.tensordot(weights, np.isinf(variances).astype(float), axes=1)
     unknown = nowhere > normal_cdf(-half_width)
@@ -314,7 +314,7 @@ def quantiles(weights: Array, means: Array, variances: Array, half_width: float)
 
 
 def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Array:
-    """(...) what as much of the mixture lies above."""
+    """(...) value above which as much of the mixture lies."""
     if len(weights) == 1:
         return np.asarray(means[0] + half_width * sds[0])
     finite, tail = np.isfinite(means) & np.isfinite(sds), float(normal_cdf(-half_width))
@@ -327,15 +327,15 @@ def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Ar
 
 
 def normal_quantile(tail: float) -> float:
-    """Standard deviations that so much of a normal variable lies above."""
+    """Return how many standard deviations have this probability of a normal variable above them."""
     return float(tail_root(lambda x, _: normal_cdf(-x), np.zeros(1), np.full(1, _REACH), tail)[0])
 
 
 def radii(weights: Array, means: Array, covariances: Array, tails: Sequence[float] = (0.05,)) -> Iterator[Array]:
-    """(N,) radius of the circle about the estimate beyond which so much of a mixture lies, of means (F, N, 2) and
-    covariances (F, N, 2, 2); for each of the tails.
+    """Yield for each tail the (N,) radius of the circle about the estimate outside which that share of a mixture lies,
+    with means (F, N, 2) and covariances (F, N, 2, 2).
 
-    The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
+    The squared length is approximated by a scaled chi-squared variable of the same mean and variance: within 1 %.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         square = covariances[..., 0, 0] + covariances[..., 1, 1] + dots(means, means)
@@ -348,7 +348,7 @@ def radii(weights: Array, means: Array, covariances: Array, tails: Sequence[floa
     square, cubed = np.where(sized, square, 1.0), np.where(sized, np.maximum(cubed, 1e-30), 1e-30)
     lost = np.tensordot(weights, (~sized & (unsized > 0.0)).astype(float), axes=1)
 
-    # The cube root of a squared length is normal; what has no size lies within any circle, what is lost beyond it.
+    # The cube root of a squared length is normal; components of size 0 lie within any circle, unknown ones outside.
     cube, spread = np.cbrt(square), np.sqrt(cubed)
     middles = np.where(sized, (1.0 - cubed) * cube, np.where(unsized > 0.0, np.inf, -np.inf))
     scales = np.where(sized, 1.0 / (cube * spread), 1.0)
@@ -363,7 +363,7 @@ def radii(weights: Array, means: Array, covariances: Array, tails: Sequence[floa
             yield each[0]
             continue
         nowhere = lost > tail
-        # Beside what is lost the rest has to lie nearer than all of it by itself.
+        # Unknown components use up some of the tail, so the radius may be larger than that of each other component.
         reach = np.where(lost > 0.0, _REACH * np.sqrt(square), each)
         largest = np.max(np.where(np.isfinite(each) & ~nowhere, reach, 0.0), axis=0)
         yield np.where(nowhere, np.inf, tail_root(above, np.zeros_like(largest), largest, tail))
@@ -373,10 +373,10 @@ _LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley wide
 
 
 class Reading(Frozen):
-    """What a posterior says of N pairs of numbers, from where the estimate has them.
+    """The distribution of N pairs of numbers by a posterior, relative to the estimate.
 
     Attributes:
-        weights: (F,) of components. means, known: (F, N, 2), (F, N, 2, 2) of each. lost: (N,) where one shows nothing.
+        weights: (F,) of components. means, known: (F, N, 2), (F, N, 2, 2) moments of each. lost: (N,) not shown by one.
         width: standard deviations from the middle to either end of a 95 % interval. is_followed: along a valley.
     """
 
@@ -389,12 +389,12 @@ class Reading(Frozen):
 
     @property
     def low(self) -> Array:
-        """(N, 2) 95 % bound of each number; infinite where unknown."""
+        """(N, 2) lower 95 % bound of each number; infinite where unknown."""
         return self._bounds[0]
 
     @property
     def high(self) -> Array:
-        """(N, 2) likewise."""
+        """(N, 2) upper 95 % bound of each number; infinite where unknown."""
         return self._bounds[1]
 
     @cached_property
@@ -408,24 +408,24 @@ class Reading(Frozen):
 
     @cached_property
     def _is_open(self) -> Mask:
-        """(N,) where a bound is infinite."""
+        """(N,) whether a bound is infinite."""
         return self.lost | are_unbounded(self.weights, self.means, self._variances, self.width).any(axis=1)
 
     @cached_property
     def radius_95(self) -> Array:
-        """(N,) 95 % of the errors are shorter."""
+        """(N,) radius within which 95 % of the errors lie."""
         far = 2.0 * float(normal_cdf(-FARTHER))
         tails = (0.05, far) if self.is_followed else (0.05,)
         near, *farther = radii(self.weights, self.means, self.known, tails)
         radius = near * self.width / NORMAL_95
-        for one in farther:  # of what is normal, _LARGER of it is 0.7 of the radius; 5 % of a valley may show nothing
+        for one in farther:  # for a normal it is 0.7 of the radius, without effect; 5 % of a valley may show nothing
             radius = np.maximum(radius, np.where(np.isfinite(one), _LARGER * one, 0.0))
         return np.where(self._is_open, np.inf, radius)
 
     @cached_property
     def _moments(self) -> tuple[Array, Array]:
         """`covariance` and `sd`."""
-        of_round = 2.447 / np.sqrt(2.0)  # 95 % of errors alike in all directions lie within, over their rms length
+        of_round = 2.447 / np.sqrt(2.0)  # 95 % radius of an isotropic error over its rms length
         covariance = np.asarray(np.einsum("f,fnij->nij", self.weights, self.known))
         with np.errstate(invalid="ignore"):
             weighted = np.transpose(self.weights[:, None, None] * self.means, (1, 2, 0))
@@ -433,7 +433,7 @@ class Reading(Frozen):
         covariance[self._is_open] = np.diag([np.inf, np.inf])
         sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
         sd = np.minimum(sd, self.radius_95 / of_round) if self.is_followed else sd
-        thin = ~np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(sd)  # a tail that nothing is known in
+        thin = ~np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(sd)  # a thin tail is unknown
         covariance[thin] = 0.5 * sd[thin, None, None] ** 2 * np.eye(2)
         return covariance, sd
 
@@ -444,7 +444,7 @@ class Reading(Frozen):
 
     @property
     def sd(self) -> Array:
-        """(N,) root mean square length of the errors; along a valley no more than the radius has it, which a thin tail
-        beyond does not move.
+        """(N,) root mean square length of the errors; along a valley no more than the radius implies, so that a thin
+        tail beyond it has no effect.
         """
         return self._moments[1]

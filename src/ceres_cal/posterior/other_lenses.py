@@ -1,20 +1,20 @@
-"""What a lens does not say of itself: other lenses that predict as well as it, and by how much it is too smooth.
+"""Other lenses that predict as well as the chosen one, and by how much the chosen one is too smooth.
 
-Where other lenses agree, the data tell them apart; at the rim and between lines they do not, and what the chosen one
-says there is its own. So they are components of the posterior, and maps show what they show, also where nothing was
-observed. The numbers of the chosen one follow each as closely as they can, by least squares over places on the floor
-and above it, or over rays of a camera that sees no floor.
+Where lenses agree, the data determine the result; at the rim and between lines they do not, and what the chosen lens
+shows there is its own. So the other lenses are components of the posterior, and maps include what they show, also where
+nothing was observed. The chosen lens's numbers follow each of them as closely as they can, by least squares over places
+on the floor and above it, or over rays of a camera that sees no floor.
 
-What a lens that is too smooth leaves displaces an image in the same way in all views: no number of views makes that
-less. What goes together within a sight alone, as a bent board or a blurred frame has it, is no lens, and does not
-count: whether sums of residuals over cells of the image agree between sights is asked first, by products of different
-sights. Bumps along the radius and over the image are columns X beside the free numbers; their coefficients scatter by
-tau (px). With P what all free numbers leave, the residuals r say u = X^T P r of them, and
+What a too smooth lens leaves displaces an image in the same way in all views: no number of views reduces it. Errors
+that are correlated within a sight only, as from a bent board or a blurred frame, are not the lens's. So it is tested
+first whether sums of residuals over cells of the image agree between sights, by products of different sights. Bumps
+along the radius and over the image are columns X beside the free numbers; their coefficients have the standard
+deviation tau (px). With P the projection onto what the free numbers leave, the residuals r give u = X^T P r, and
 
     Cov u = kappa V + tau^2 V V,    V = X^T P X,
 
-kappa for what goes together within a view. The restricted likelihood of tau, of each kind of bumps, says how rough the
-lens is. By what the free numbers take up of them they are off.
+with kappa for errors correlated within a view. The restricted likelihood of tau, for each kind of bumps, estimates how
+rough the lens is. The free numbers are off by what they absorb of the bumps.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 
-_PLACES = 12  # along each side of the picture
-# How closely the heights of HEIGHTS_M are followed. Above the floor phi tells, and the quadratic picture bends:
-# followed as closely, what lenses with another phi show there ruins the floor; not at all, one map in ten was 2.5
-# standard deviations off there.
+_PLACES = 12  # grid points along each side of the picture
+# Weights with which other lenses are followed at HEIGHTS_M. Above the floor phi matters, and the quadratic model is
+# inaccurate: with full weight, what lenses with another phi show there spoils the floor; with none, one map in ten was
+# 2.5 standard deviations off there.
 _PARTS = (1.0, 0.1)
 
 
@@ -45,9 +45,9 @@ class OtherLenses(Frozen):
     """Other lenses than the chosen one, solved for from the same observations.
 
     Attributes:
-        near: with the chosen lens. others: with others. weights: of each, its probability or less.
-        reach_px: camera -> how far from its principal point it was observed: farther out nothing is compared.
-        failed: why nothing could be compared; "" where it could.
+        near: estimate with the chosen lens. others: with other lenses. weights: of the others, probabilities or less.
+        reach_px: camera -> distance from its principal point that observations reach: nothing is compared farther out.
+        failed: why nothing could be compared, else "".
     """
 
     near: Estimate
@@ -58,12 +58,12 @@ class OtherLenses(Frozen):
 
     @cached_property
     def pixels(self) -> dict[str, Array]:
-        """Camera -> (N, 2) of a grid over its image, as far as it was observed."""
+        """Camera -> (N, 2) pixels of a grid over its image, as far as it was observed."""
         return {name: _places_of(self.near.cameras[name], reach_px) for name, reach_px in self.reach_px.items()}
 
 
 class OpenDirection(NamedTuple):
-    """How numbers (K) vary with one of a camera's, by a standard deviation of that."""
+    """How numbers (K) vary with one number of a camera, by one standard deviation of that number."""
 
     along: Key
     keys: tuple[Key, ...]
@@ -71,10 +71,11 @@ class OpenDirection(NamedTuple):
 
 
 class LensSpread(Frozen):
-    """How numbers vary with a lens.
+    """The covariance of numbers with one lens.
 
     Attributes:
-        there: with it. keys: (K) the numbers. root: (K, R) a root of their covariance. slopes: see `shown_slopes`.
+        there: with the lens. keys: (K) the numbers. root: (K, R) a root of their covariance. slopes: see
+            `shown_slopes`.
     """
 
     there: Estimate
@@ -83,17 +84,17 @@ class LensSpread(Frozen):
     slopes: Sequence[Array]
 
     def beyond(self, chosen: LensSpread, probability: float) -> Sequence[OpenDirection]:
-        """What this lens leaves open and the chosen one does not, along one number of a camera after the other, as far
-        as it makes a difference to what pixels show at a height, where they were observed or farther out.
+        """Return the directions that this lens leaves open and the chosen one does not, along one number of a camera
+        after the other, as far as they change what pixels show at a height, where they were observed or farther out.
 
-        Straight from above the form of a lens alone tells phi. Of a floor one coefficient knew it to 0.4 %, 16 standard
-        deviations off at robot height; three, which predicted as well, knew it to 10 %. In a cropped picture's corner
-        two knew a place to 10 mm, 60 off, and four, which predicted better, to 36.
+        From straight above only the form of the lens determines phi. Over a floor one coefficient gave it to 0.4 %, 16
+        standard deviations off at robot height; three, which predicted as well, to 10 %. In a cropped picture's corner
+        two gave a place to 10 mm, 60 mm off; four, which predicted better, to 36 mm.
 
         Args:
             probability: of this lens.
         """
-        least = 0.25  # of all variance by the chosen lens, for a direction to be worth two more components
+        least = 0.25  # of all variance with the chosen lens: a direction with more is worth two more components
         columns = [i for i, key in enumerate(self.keys) if key.kind == "camera" and np.any(self.root[i])]
         found, root, tiny = list[OpenDirection](), self.root, np.finfo(float).tiny
         of_chosen, own = self._shown_beside(chosen)
@@ -112,8 +113,8 @@ class LensSpread(Frozen):
         return found
 
     def _shown_beside(self, chosen: LensSpread) -> tuple[Array, Array]:
-        """(N, R), (N, Q) how what pixels show varies with the chosen lens and with this one, each height and part of
-        the picture over all that it varies with the chosen one.
+        """(N, R), (N, Q) how what pixels show varies with the chosen lens and with this one, at each height and part of
+        the picture relative to all its variation with the chosen one.
         """
         each = [(np.empty((0, chosen.root.shape[1])), np.empty((0, self.root.shape[1])))]
         for of_chosen, own in zip(chosen.shown, self.shown, strict=True):
@@ -126,11 +127,11 @@ class LensSpread(Frozen):
 
     @property
     def shown(self) -> Sequence[Array]:
-        """(N, R) of each of the slopes, how what pixels show varies."""
+        """(N, R) for each of the slopes: how what pixels show varies."""
         return [slopes @ self.root for slopes in self.slopes]
 
     def _along(self, along: Key, step: Array) -> OpenDirection:
-        """The direction, no farther than to half of phi and half as much again."""
+        """Return the direction, shortened such that phi changes by at most half of itself."""
         most = 0.5
         phi = [(i, self.there.cameras[key.owner].phi) for i, key in enumerate(self.keys) if key.quantity == "phi"]
         far = max((abs(float(step[i])) / size for i, size in phi), default=0.0)
@@ -139,11 +140,11 @@ class LensSpread(Frozen):
 
 
 def shown_slopes(there: Estimate, keys: Sequence[Key], lenses: OtherLenses) -> Sequence[Array]:
-    """(N, K) how what pixels show moves with numbers of an estimate, at each height where they were observed, and
-    farther out: the same for all lenses of a kind.
+    """Return (N, K) derivatives of what pixels show by numbers of an estimate, for each height, where they were
+    observed and farther out; they are the same for all lenses of a kind.
 
     Args:
-        lenses: with the pixels that are asked, and none besides yet.
+        lenses: with the pixels in question; it needs no other lenses yet.
     """
     near, found = lenses.near, list[Array]()
     for name, reach_px in lenses.reach_px.items():
@@ -156,12 +157,12 @@ def shown_slopes(there: Estimate, keys: Sequence[Key], lenses: OtherLenses) -> S
 
 
 def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate) -> OtherLenses:
-    """Those of several cameras, each with its own probabilities, in as many combinations as there are lenses: for each
-    camera its others and then the chosen one have their probabilities beside each other from 0 to 1, and what has one
-    place there is a combination.
+    """Combine those of several cameras, each with its own probabilities, into about as many combinations as there are
+    lenses: for each camera the others and then the chosen one divide the interval from 0 to 1 by their probabilities,
+    and lenses that share a part of the interval are a combination.
 
     Args:
-        floors: stations that see the floor. end: where the others stand, which a camera by itself does not know.
+        floors: stations that see the floor. end: poses of the others, which one camera does not determine.
     """
     if len(each) == 1:
         return each[0]
@@ -184,7 +185,7 @@ def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate)
 
 
 def _places_of(camera: Camera, reach_px: float = np.inf) -> Array:
-    """(N, 2) px of a grid over a camera's image, so far from its principal point."""
+    """(N, 2) px of a grid over a camera's image, up to this distance from its principal point."""
     x, y = (np.linspace(0.0, side - 1.0, _PLACES) for side in camera.image_size)
     places = grid_places(x, y)
     return np.asarray(places[_distance_px(camera, places) <= reach_px])
@@ -195,19 +196,19 @@ def _distance_px(camera: Camera, places: Array) -> Array:
 
 
 def counted(weights: Sequence[float]) -> Array:
-    """(L,) probabilities of other lenses as far as they count, together less than all."""
-    most = 0.8  # of all of them together
+    """(L,) probabilities of other lenses, reduced such that some is left for the chosen one."""
+    most = 0.8  # upper limit of their sum
     each = np.asarray(weights, dtype=float)
     return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[Estimate]) -> Array:
-    """(M, L, K) of numbers of M estimates, which follow each of the others by least squares.
+    """(M, L, K) shifts of the numbers of M estimates that follow each of the other lenses by least squares.
 
     Args:
-        nodes: with the chosen lens, at its best or elsewhere in a valley along phi.
+        nodes: with the chosen lens, at its minimum or elsewhere in a valley along phi.
     """
-    followed = 1e-4  # of the largest singular value: directions that show less are not moved along
+    followed = 1e-4  # of the largest singular value: numbers do not move along weaker directions
     shown, found = list(_shown(keys, lenses.near, lenses.pixels)), np.zeros((len(nodes), len(lenses.others), len(keys)))
     if not shown:
         return found
@@ -227,10 +228,10 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[E
 def shifts_along(
     camera: str, here: Estimate, known: Information, shifts: Array, nodes: Sequence[tuple[Estimate, Information]]
 ) -> Array:
-    """(M, S, K) of numbers of M estimates, each with what is known of them there, which show on the floor what shifts
-    (S, K) of one estimate's show, each place as far as it is known; what no place shows stays where it is.
+    """(M, S, K) shifts of the numbers of M estimates, each with its information, that show on the floor what shifts (S,
+    K) of one estimate show, with places weighted by their accuracy; numbers that no place shows are not shifted.
     """
-    loosely = 0.1  # as in units of what is known at a node: shifts of ten sigmas that no place shows cost as one sigma
+    loosely = 0.1  # weight of a node's information: shifts of ten sigmas that no place shows cost as one sigma
     shown = list(_shown(known.keys, here, {camera: _places_of(here.cameras[camera])}))
     slopes, found = _slopes_of(shown, known.keys, here), np.zeros((len(nodes), *shifts.shape))
     squares = np.sum((slopes @ known.spread.covariance) * slopes, axis=1).reshape(-1, 2).sum(axis=1)
@@ -246,13 +247,13 @@ def shifts_along(
 
 
 def _slopes_of(shown: Sequence[tuple[float, Functional]], keys: Sequence[Key], there: Estimate) -> Array:
-    """(2 N, K) px of all that is shown, by each of the keys."""
+    """(2 N, K) px derivatives of all that is shown, by each of the keys."""
     return np.concatenate([weight * one.slopes(there, keys).reshape(-1, len(keys)) for weight, one in shown])
 
 
 def _shown(keys: Sequence[Key], near: Estimate, pixels: Mapping[str, Array]) -> Iterator[tuple[float, Functional]]:
-    """What pixels of cameras show that the keys say anything of, each with its weight, px per unit: places on the
-    floor, where phi is free also above it, and rays of a camera that sees no floor.
+    """Yield what pixels of cameras show that depends on the keys, each with its weight, px per unit: places on the
+    floor, and above it where phi is free, or rays of a camera that sees no floor.
     """
     known = dict.fromkeys(key.owner for key in keys if key.kind == "station")
     spoken_of = {key.owner for key in keys if key.kind == "camera"} | {near.stations[name].camera for name in known}
@@ -270,13 +271,13 @@ def _shown(keys: Sequence[Key], near: Estimate, pixels: Mapping[str, Array]) -> 
 
 
 AGREES = 2.5
-"""From how many standard deviations on a lens leaves something: of one that leaves nothing one in 160 does."""
-# Observations on average; cells along the image: some show what is long, many what a surface's nodes do not follow.
+"""Standard deviations above which a lens leaves systematic residuals: a perfect one exceeds them once in 160 times."""
+# Mean observations in a cell; cells along the image: few show long waves, many what a surface's nodes do not follow.
 _IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
 
 
 class LensResiduals(Frozen):
-    """What a lens leaves of some sights.
+    """The residuals of a lens in some sights.
 
     Attributes:
         points, curves: (N, 2), (M,) residuals, in standard deviations. cameras: by name.
@@ -289,10 +290,10 @@ class LensResiduals(Frozen):
 
     @classmethod
     def of(cls, sights: Sights, there: Residuals, scales: tuple[float, float], estimate: Estimate) -> LensResiduals:
-        """At an estimate; of very many equations those of some sights.
+        """Return the residuals at an estimate; of very many equations only those of some sights.
 
         Args:
-            sights: of what took part. scales: of the noise of points and curves, over what is stated.
+            sights: of the inliers. scales: noise scales of points and curves, on the stated sigmas.
         """
         most_compared = 50_000
         every = -(-sights.equations // most_compared)
@@ -303,13 +304,13 @@ class LensResiduals(Frozen):
 
     @classmethod
     def of_end(cls, end: RobustSolution, sights: Sights | None = None) -> LensResiduals:
-        """At the end of all rounds, of some sights or of all that took part."""
+        """Return the residuals at the end of all rounds, of some sights or of all that took part."""
         sights = end.problem.sights if sights is None else sights
         return cls.of(sights, end.residuals, end.problem.weighting.scales, end.estimate)
 
     @property
     def in_cells(self) -> float:
-        """By how many standard deviations sums of residuals over a cell have one sign in all sights; 0 of one sight."""
+        """Standard deviations by which sums of residuals over a cell agree in sign in all sights; 0 of one sight."""
         sizes = {name: camera.image_size for name, camera in self.cameras.items()}
         of_points, of_curves = _sight_of(self.sights.point_bounds), _sight_of(self.sights.curve_bounds)
         sight = np.concatenate([of_points, of_points, of_curves])
@@ -318,7 +319,7 @@ class LensResiduals(Frozen):
 
     @property
     def in_rings(self) -> float:
-        """The same of sums over rings about the principal point, of how far out points lie; of cameras the most."""
+        """The same for sums over rings about the principal point, of radial residuals of points; largest of cameras."""
         rings = 24  # from the middle to the farthest observation
         agree = 0.0
         for name, camera in self.cameras.items():
@@ -332,26 +333,26 @@ class LensResiduals(Frozen):
 
     @property
     def asks_for_more(self) -> bool:
-        """Whether another lens would leave less in the same places of all sights."""
+        """Whether another lens would leave smaller residuals in the same places of all sights."""
         return max(self.in_cells, self.in_rings) > AGREES
 
 
 def of_placements(sights: Sights) -> Sights:
-    """Those of what lies elsewhere in each view. Lines of a floor that are painted aside leave the same in all views of
-    a camera that stands still, whatever its lens.
+    """Return the sights of targets that move from view to view. Floor lines that are painted off their nominal position
+    leave the same residuals in all views of a fixed camera, whatever its lens.
     """
     return sights.take(np.flatnonzero([key.placement is not None for key in sights.keys]))
 
 
 def _sight_of(bounds: Indices) -> Indices:
-    """Of each observation its sight's number; of very many sights, that of some beside each other."""
-    most_groups = 200  # of sights: products within one do not count, a half of a percent
+    """(N,) number of each observation's sight; where there are very many, neighbouring sights share a number."""
+    most_groups = 200  # of sights: products within a group do not count, half a percent of all
     sights = len(bounds) - 1
     return np.repeat(np.arange(sights) * min(sights, most_groups) // max(sights, 1), np.diff(bounds))
 
 
 def _agreement(place: Indices, sight: Indices, left: Array) -> float:
-    """By how many standard deviations the sums of residuals (N,) by place (N,) agree between sights (N,)."""
+    """Return by how many standard deviations sums of residuals (N,) by place (N,) agree between sights (N,)."""
     count = int(np.max(sight, initial=0)) + 1
     size = count * (int(np.max(place, initial=0)) + 1)
     sums = np.bincount(place * count + sight, left, size).reshape(-1, count)
@@ -359,8 +360,8 @@ def _agreement(place: Indices, sight: Indices, left: Array) -> float:
 
 
 def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _MOST_CELLS) -> Indices:
-    """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, each curve apart;
-    no more than so many along the image.
+    """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, with cells of its own
+    for each curve; at most so many along the image.
     """
     names = sorted(sizes)
     count = (len(sights.point_rows) + len(sights.curve_rows)) / (_IN_A_CELL * len(names))
@@ -378,14 +379,14 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
     return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
 
 
-# Bumps from the middle to the farthest observation, and along the longer side of the image: with one size more between
-# them rays are as far off over what is stated, and it takes four times as long.
+# Bumps from the middle to the farthest observation, and along the longer side of the image, in two sizes: with another
+# size between them, errors of rays over what is stated are the same, and it takes four times as long.
 _ALONG, _OVER = 36, (7, 21)
 
 
 def shifts_by_roughness(end: RobustSolution, cameras: Iterable[str]) -> tuple[Sequence[Key], Sequence[Array]]:
-    """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
-    lenses of some cameras do to them.
+    """Return numbers (K), and shifts (K,) of them; the sum of the shifts' outer products is the covariance that the
+    roughness of some cameras' lenses adds.
     """
     reduced = end.information
     model = _linearised(end, reduced)
@@ -394,8 +395,8 @@ def shifts_by_roughness(end: RobustSolution, cameras: Iterable[str]) -> tuple[Se
 
 
 def _linearised(end: RobustSolution, reduced: ReducedInformation) -> Linearised:
-    """Some sights' equations, beside their share of what was known before."""
-    most_equations = 12_000  # that tell how rough a lens is: of more, those of some views
+    """Return the linearised equations of some sights, beside their share of the prior information."""
+    most_equations = 12_000  # to estimate how rough a lens is; of more, those of some views
     problem, estimate = end.problem, end.estimate
     every = max(1, -(-problem.sights.equations // most_equations))
     sights = problem.sights[::every]
@@ -407,9 +408,9 @@ def _linearised(end: RobustSolution, reduced: ReducedInformation) -> Linearised:
 
 
 def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
-    """(R, K) by the bumps of a camera's image."""
-    at_rest = 0.02  # relative change of a size
-    loose_px, least_px = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
+    """(R, K) shifts of the numbers by the bumps of a camera's image."""
+    at_rest = 0.02  # relative change of a size at convergence
+    loose_px, least_px = 3.0, 1e-3  # sizes of bumps: before the data are used, and the smallest
     equations, rows = model.equations, model.equations.bounds[:-1]
     own = equations.of_sights(np.array([key.camera == name for key in equations.sights.keys]))
     every = list(_bumps(equations, camera, own))
@@ -429,7 +430,7 @@ def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
 
 def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:
     """(E, Q) px per px of bumps along the radius and over the image, as far as a camera's own equations (E,) reach;
-    none so small that most of them have fewer than eight.
+    none so small that most of them have fewer than eight equations.
     """
     offsets = camera.offsets(equations.pixel)
     radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
@@ -445,5 +446,5 @@ def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:
 
 
 def _hats(place: Array, count: int) -> Array:
-    """(E, count + 1) straight up to 1 at each whole number from 0 to the count, and down."""
+    """(E, count + 1) hat functions: 1 at a whole number from 0 to the count, and linear to 0 at its neighbours."""
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(count + 1))))

@@ -1,4 +1,4 @@
-"""What a calibration knows of its own numbers: kept as information, read as standard deviations."""
+"""What a calibration knows of its own numbers, stored as information and read as standard deviations."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from ceres_cal.problem.quantities import difference
 from ceres_cal.problem.reduced import PrivatePlacements, ReducedInformation
 
 LEAST_PROBABILITY = 0.02
-"""From which on something else that may be true counts: all that has less makes no difference."""
+"""Probability from which on an alternative counts; below it, it makes no difference."""
 
 
 class Posterior(Frozen):
-    """What observations and priors say together, about the solution, at the noise that was estimated.
+    """The posterior: what observations and priors determine at the solution, with the estimated noise.
 
-    It is kept as information because a covariance does not exist where something is unknown. Errors that go together
-    count together, as far as the residuals show it (`dependence`); what all views have in common, such as a field
-    painted amiss, is not in it.
+    It is stored as information because a covariance does not exist where something is unknown. Correlated errors are
+    included as far as the residuals show them (`dependence`). Errors that all views have in common, such as a field
+    painted off its nominal position, are not.
 
     Attributes:
-        information: about the P numbers that are shared: the normal distribution that advice takes, as the normal
-            equations have it, with the second moments of what else may be true. A refit and a check take `normal`.
+        information: about the P shared numbers: the normal distribution of the normal equations with the second moments
+            of the alternatives, which advice uses. A refit and a check use `normal`.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
-        mixtures: camera -> what it and its stations may be, where its phi was followed along its profile, or a refit
-            left it as it was; "" -> what everything else may be, where that is no one normal distribution. Standard
-            deviations, bounds and maps are read off these.
-        lenses: the estimate with the chosen lens and those with others that predict as well, from the same
-            observations: what components of the mixtures that are another lens show.
-        stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
-        by_model: what the model alone says of the shared numbers, were every error independent of the others; None
-            where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
+        mixtures: camera -> distribution of its and its stations' numbers, where its phi was followed along its profile
+            or a refit kept them; "" -> distribution of everything else, where it is no single normal distribution.
+            Standard deviations, bounds and maps are computed from these.
+        lenses: estimate with the chosen lens, and those with others that predict as well, from the same observations;
+            components of the mixtures that are another lens show these.
+        stated: the part of the information that was known beforehand. It is never widened: see `wider`.
+        by_model: information about the shared numbers by the model alone, with independent errors; None where that is
+            `information` itself. dependence: basis of the difference; None where it was not estimated.
     """
 
     information: Information
@@ -64,7 +64,7 @@ class Posterior(Frozen):
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """(P) the numbers that are shared."""
+        """(P) the shared numbers."""
         return self.information.keys
 
     @property
@@ -74,26 +74,26 @@ class Posterior(Frozen):
 
     @property
     def followed_phi(self) -> frozenset[Key]:
-        """Their phi."""
+        """Keys of the phi of these cameras."""
         return frozenset(self.mixtures[name].keys[0] for name in self.followed)
 
     def mixture(self, camera: str = "") -> Mixture:
-        """What a camera and its stations may be, or everything together, but for cameras whose phi was followed."""
+        """Return the distribution of a camera and its stations, or of everything but cameras whose phi was followed."""
         found = self.mixtures.get(camera) or self.mixtures.get("")
         return found or Mixture.of_one(self.information)
 
     def of(self, own: Mask) -> Posterior:
-        """What it is where one of these components (C,) of its one mixture is the right one."""
+        """Return the posterior if one of these components (C,) of its only mixture is right."""
         return replace(self, mixtures={"": self.mixture().of(own)})
 
     def with_alternatives(
         self, keys: Sequence[Key], shifts: Sequence[Array], weights: Sequence[float], lenses: tuple[Estimate, ...] = ()
     ) -> Posterior:
-        """The posterior where something else may be true: shifts (S, K) of some numbers, with the probability of each.
+        """Return the posterior with alternatives: shifts (S, K) of some numbers, with the probability of each.
 
-        Where these follow other lenses, the estimate with the chosen one is given, and with each of them. They are
-        components of the mixtures, which have all else once more beside them, and in the information by their second
-        moments.
+        Where these follow other lenses, `lenses` are the estimate with the chosen one and those with each of them.
+        Alternatives become components of the mixtures, each a copy of all others, and enter the information by their
+        second moments.
         """
         if not len(shifts):
             return self
@@ -109,11 +109,11 @@ class Posterior(Frozen):
         return replace(self._known_by(information, mixtures), lenses=self.lenses or lenses)
 
     def beside(self, known: Information, step: Array, weight: float, let_go: Collection[Key] = ()) -> Posterior:
-        """The posterior where something else may be true, which knows all numbers in its own way.
+        """Return the posterior with an alternative that has its own information about all numbers.
 
         Args:
-            known: of all of them where that is true. step: (P,) how far they are then. weight: its probability.
-            let_go: what it does not take as it was stated.
+            known: about all numbers under the alternative. step: (P,) their shift there. weight: its probability.
+            let_go: statements that it does not accept.
         """
         mixtures = {"": self.mixture().beside(Mixture.of_one(known.given(self.keys), step), weight)}
         for name in self.followed:
@@ -124,8 +124,8 @@ class Posterior(Frozen):
         return loose._known_by(loose._as_wide_as(self.information, [mixtures[""]]), {**self.mixtures, **mixtures})
 
     def widened(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
-        """The posterior whose numbers scatter by shifts (S, K) of some of them as well: each goes into the covariance
-        of what the observations say, of every component, as d d^T.
+        """Return the posterior with further scatter of its numbers, by shifts (S, K) of some of them: each adds d d^T
+        to the covariance of what the observations say, in every component.
         """
         if not len(shifts):
             return self
@@ -138,14 +138,14 @@ class Posterior(Frozen):
         return self._known_by(wider(self.information), mixtures)
 
     def _known_by(self, information: Information, mixtures: Mapping[str, Mixture]) -> Posterior:
-        """The same with other mixtures, and the information that has their second moments."""
+        """Return a copy with other mixtures and the information that has their second moments."""
         placements = self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
         return replace(self, information=information, placements=placements, mixtures=mixtures)
 
     def _beside_stated(self, shifts: Array) -> Array:
-        """(S, P) shifts as far as what was stated lets each of them be: never more than its standard deviation."""
+        """(S, P) shifts, limited by what was stated: none is larger than its standard deviation."""
         if not np.any(self.stated.matrix):
             return shifts
         stated = self.stated.over(self.keys)
@@ -155,18 +155,18 @@ class Posterior(Frozen):
         return np.asarray(np.clip(moved, -room, room))
 
     def wider(self, information: Information, how: Callable[[Information], Information]) -> Information:
-        """Information about some of the numbers, with what observations say of them made wider, beside what was stated
-        of them as it was: so nothing is known worse than it was stated, whatever widens.
+        """Return information about some of the numbers in which what observations say is widened, and what was stated
+        is unchanged: so nothing is known worse than it was stated.
 
         Args:
-            information: of everything. how: what makes wider what the observations say by themselves.
+            information: of everything. how: widens what the observations alone say.
         """
         stated = self.stated.over(self.keys).marginal(information.keys)
         return how(information.less(stated)) + stated
 
     @cached_property
     def stated_sd(self) -> Array:
-        """(P,) standard deviations by what was stated alone, infinite where that says nothing."""
+        """(P,) standard deviations by the statements alone, infinite where nothing was stated."""
         sd = np.full(len(self.keys), np.inf)
         sd[self.information.columns(self.stated.keys)] = self.stated.spread.sd
         return sd
@@ -178,22 +178,22 @@ class Posterior(Frozen):
 
     @cached_property
     def normal(self) -> Information:
-        """The normal distribution that stands for all of it where it is a prior: in every direction at least as wide as
-        the mixtures. By the normal equations alone other observations of a valley that bends as this one does would
-        agree with it at the estimate only, and seem to know phi.
+        """The normal distribution that represents all of it as a prior: in every direction at least as wide as the
+        mixtures. With the normal equations alone, other observations of a valley with the same bend would agree with it
+        only at the estimate, and would seem to determine phi.
         """
         return self._as_wide_as(self.information, self._read)
 
     @cached_property
     def normal_of_lens(self) -> Information:
-        """The same where the chosen lens is the right one: for those who ask the other lenses themselves."""
+        """`normal` if the chosen lens is right, for callers that evaluate the other lenses themselves."""
         if len(self.lenses) < 2:
             return self.normal
         return self._as_wide_as(self.of_lens, (mixture.chosen for mixture in self._read))
 
     @property
     def of_lens(self) -> Information:
-        """The normal equations where the chosen lens is the right one."""
+        """The information by the normal equations if the chosen lens is right."""
         if len(self.lenses) < 2:
             return self.information
         alone = self.mixture().chosen
@@ -207,7 +207,7 @@ class Posterior(Frozen):
 
     @property
     def lens_weights(self) -> tuple[float, ...]:
-        """The probability of each of the lenses beside the chosen one."""
+        """Probabilities of the lenses other than the chosen one."""
         mixture = self.mixture()
         of_lens = np.array([lens for lens, _ in mixture.lenses.values()], dtype=np.int64)
         weights = mixture.weights[np.array(list(mixture.lenses), dtype=np.int64)]
@@ -215,7 +215,7 @@ class Posterior(Frozen):
 
     @property
     def across(self) -> Information:
-        """The information with phi held of cameras where it was followed: what goes with it may be as open."""
+        """The information with phi held for cameras where it was followed: correlated numbers may be as open."""
         return self.information.given([key for key in self.keys if key not in self.followed_phi])
 
     @cached_property
@@ -233,14 +233,14 @@ class Posterior(Frozen):
 
     @property
     def _read(self) -> Iterator[Mixture]:
-        """Mixtures, those of single cameras last."""
+        """The mixtures, those of single cameras last."""
         yield from (self.mixtures[name] for name in sorted(self.mixtures, key=bool))
 
     @cached_property
     def _numbers(self) -> tuple[Mixture, ...]:
-        """The same, where each number is read by itself: a component that is another lens of the same kind has that
-        lens's own phi and height. By what the chosen lens shows likewise phi was known to 0.2 %, 20 standard deviations
-        off, where a coefficient that it has not leaves it open to 5 %.
+        """The mixtures for reading single numbers: a component with another lens of the same kind has that lens's own
+        phi and height. With the numbers by which the chosen lens shows the same, phi was known to 0.2 %, 20 standard
+        deviations off, where a coefficient that the chosen lens lacks leaves it open to 5 %.
         """
         found = []
         for mixture in self._read:
@@ -252,9 +252,9 @@ class Posterior(Frozen):
         return tuple(found)
 
     def _off(self, lens: int, keys: Sequence[Key]) -> Array:
-        """(K,) phi and where cameras stand with a lens, from what the chosen one has; NaN of all else: of another kind
-        of lens, of coefficients, which mean another thing beside others, of what is followed, and beside boards that
-        several cameras see: each lens was solved for without the other cameras.
+        """(K,) phi and stations' poses with a lens, relative to the chosen one; NaN for all else: for another kind of
+        lens; for coefficients, whose meaning depends on the others; for numbers that are followed; and beside boards
+        that several cameras see, because each lens was solved for without the other cameras.
         """
         chosen, other, off = self.lenses[0], self.lenses[lens], np.full(len(keys), np.nan)
         if any(key.kind == "placement" for key in self.keys):
@@ -268,7 +268,7 @@ class Posterior(Frozen):
 
     @cached_property
     def factors(self) -> Array:
-        """(P,) standard deviations over what the model alone gives; 1 where both are infinite."""
+        """(P,) standard deviations over those by the model alone; 1 where either is infinite."""
         if self.by_model is None:
             return np.ones(len(self.keys))
         return widths_over(self.spread, self.by_model.spread)
@@ -276,7 +276,7 @@ class Posterior(Frozen):
     @property
     def half_width(self) -> float:
         """Standard deviations from the middle to either end of a 95 % interval: Student's t, with the degrees of
-        freedom behind the noise and behind what is known of the dependence.
+        freedom of the noise and of the estimated dependence.
         """
         inverse = 1.0 / max(self.degrees_of_freedom, 1.0)
         inverse += 0.0 if self.dependence is None else self.dependence.inverse_freedom
@@ -284,12 +284,12 @@ class Posterior(Frozen):
 
     @cached_property
     def bounds(self) -> Array:
-        """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
-        limit = NORMAL_95 * self.stated_sd[:, None]  # what was stated rests on no estimated noise
+        """(P, 2) 95 % bounds of the shared numbers, relative to the estimate; infinite on an open side."""
+        limit = NORMAL_95 * self.stated_sd[:, None]  # a statement does not depend on the estimated noise
         return np.clip(self.bounds_at(self.half_width), -limit, limit)
 
     def bounds_at(self, width: float) -> Array:
-        """(P, 2) the same so many standard deviations up, at most three."""
+        """(P, 2) bounds at so many standard deviations, at most three."""
         bounds = width * self.spread.sd[:, None] * (-1.0, 1.0)
         for mixture in self._numbers:
             bounds[self.information.columns(mixture.keys)] = mixture.bounds(width)
@@ -297,23 +297,23 @@ class Posterior(Frozen):
         return np.clip(bounds, -limit, limit)
 
     def layout(self, estimate: Estimate) -> Layout:
-        """The layout of everything that it speaks of."""
+        """Return the layout of all numbers that it knows."""
         return layout_of(self.keys, estimate, self.placements)
 
     def keys_of(self, estimate: Estimate, station: str) -> tuple[Key, ...]:
-        """Keys of a station and of its camera."""
+        """Return the keys of a station and of its camera."""
         owners = {("station", station), ("camera", estimate.stations[station].camera)}
         return tuple(key for key in self.keys if key[:2] in owners)
 
     def knows_station(self, station: str) -> bool:
-        """Whether it says where a station stands: not of one that was held as the world."""
+        """Return whether it knows a station's pose: not if the station was held as the world."""
         return any(key[:2] == ("station", station) for key in self.keys)
 
     def column(self, kind: str, owner: str, quantity: str) -> int:
-        """Where a number is among the keys.
+        """Return the index of a number among the keys.
 
         Raises:
-            InputError: it is not: held, or not there at all.
+            InputError: the number was held, or does not exist.
         """
         for column, key in enumerate(self.keys):
             if key[:3] == (kind, owner, quantity):
@@ -322,7 +322,7 @@ class Posterior(Frozen):
         raise InputError(f"{kind} {owner!r} has no free number {quantity!r}{meant or ': it was held, or is not there'}")
 
     def sd_of(self, kind: str, owner: str, quantity: str) -> float:
-        """Standard deviation of one shared number, in its key's unit; 0 is never one, infinity means unknown.
+        """Standard deviation of one shared number, in its key's unit; never 0, infinite where unknown.
 
         Raises:
             InputError: it is not a free number.
@@ -330,7 +330,7 @@ class Posterior(Frozen):
         return float(self.sd[self.column(kind, owner, quantity)])
 
     def placement(self, name: str) -> Spread:
-        """What is known of a placement's six numbers (`keys.PLACEMENT_QUANTITIES`).
+        """Return the distribution of a placement's six numbers (`keys.PLACEMENT_QUANTITIES`).
 
         Raises:
             InputError: no such placement, or it was held.
@@ -350,20 +350,20 @@ def widths_over(spread: Spread, other: Spread) -> Array:
 
 
 def _along_phi(valley: Mixture, known: Information, step: Array) -> Mixture:
-    """A normal distribution, so far (K,) from the estimate, as components along phi as those of a valley are."""
+    """Return a normal distribution, so far (K,) from the estimate, as components along phi like those of a valley."""
     phi, along = valley.phi_px + step[0], known.spread.covariance[0]
     sd = np.sqrt(along[0])
-    roots = min(FARTHER, 0.5 * phi / sd) * np.array([-1.0, 0.0, 1.0])  # to half of phi and half as much again
+    roots = min(FARTHER, 0.5 * phi / sd) * np.array([-1.0, 0.0, 1.0])  # phi changes by at most half of itself
     steps, across = step + roots[:, None] * along / sd, known.given(valley.keys[1:])
     return Mixture.along_phi(valley.keys, valley.phi_px, steps, roots**2, [across] * 3, (False, False))
 
 
 def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatter: Scatter | None = None) -> Posterior:
-    """The posterior of everything shared, and of the placements that were eliminated.
+    """Return the posterior of all shared numbers, and of the placements that were eliminated.
 
     Args:
         degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
-        scatter: how the data scatter; without it errors are independent.
+        scatter: how the data scatter; without it errors count as independent.
     """
     model, stated = reduced.shared, reduced.stated
     if scatter is None:
@@ -374,10 +374,10 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
 
 
 class _Placements(Frozen, Mapping[str, Information]):
-    """Information about each eliminated placement, worked out when the first one is asked for.
+    """Information about each eliminated placement, computed when the first one is used.
 
     Attributes:
-        shared: about what they follow. inflation: factor on the variance that their own observations leave.
+        shared: about the numbers on which they depend. inflation: factor on the variance by their own observations.
     """
 
     eliminated: tuple[PrivatePlacements, ...]
@@ -404,9 +404,9 @@ class _Placements(Frozen, Mapping[str, Information]):
 
 
 def _placement_information(part: PrivatePlacements, shared: Information, inflation: float) -> Array:
-    """(S, 6, 6) information about each placement, everything shared integrated out.
+    """(S, 6, 6) information about each placement, all shared numbers integrated out.
 
-    A placement follows the shared numbers by -G, and deviates from that by what its own observations leave open:
+    A placement moves with the shared numbers by -G, and scatters about that by what its own observations leave open:
     covariance own^-1 + G C G^T where both exist, else the Schur complement of the two together.
     """
     regular = part.ranks > 5.5

@@ -1,6 +1,6 @@
-"""The seam between two cameras: by how much they may, and do, disagree about what both of them see.
+"""The seam between two cameras: how much they may, and do, disagree about what both of them see.
 
-How two cameras stand to each other: baseline and angle, with standard deviations.
+Also the relative pose of two cameras: baseline and angle, with standard deviations.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Key, moved, natural_sizes
 from ceres_cal.scene import Camera, Target, along_track, nearest_on_track, turned_on
 
-_STEP = 1e-6  # of a number's natural size, either way, for derivatives
+_STEP = 1e-6  # step of central differences, as a share of a number's natural size
 
 
 class RigPair(Frozen, eq=True):
-    """Two stations, and how the second stands to the first.
+    """Two stations, and the relative pose of the second to the first.
 
     Attributes:
         baseline_m, baseline_sd_m: between their positions. angle_rad, angle_sd_rad: between their orientations, about
-            whichever axis; a standard deviation is infinite where nothing is known of one of them.
+            any axis; a standard deviation is infinite where one of them is unknown.
     """
 
     stations: tuple[str, str]
@@ -45,8 +45,8 @@ class RigPair(Frozen, eq=True):
 
 
 def rig_pairs(estimate: Estimate, posterior: Posterior) -> tuple[RigPair, ...]:
-    """The first station with each one of another camera; none where several are worlds of their own, which stand in no
-    relation to each other.
+    """Return the pairs of the first station and each station of another camera; none where several stations are worlds
+    of their own, whose relative poses are unknown.
     """
     first, *others = estimate.stations
     camera = estimate.stations[first].camera
@@ -68,7 +68,7 @@ def _pair(estimate: Estimate, posterior: Posterior, first: str, second: str) -> 
 
 
 def _slopes(estimate: Estimate, keys: Sequence[Key], first: str, second: str) -> Array:
-    """(2, K) of baseline and angle by each of the keys."""
+    """(2, K) derivatives of baseline and angle by each of the keys."""
     slopes = np.zeros((2, len(keys)))
     for column, (key, step) in enumerate(zip(keys, _STEP * natural_sizes(estimate, keys), strict=True)):
         if key[:2] in (("station", first), ("station", second)):
@@ -85,10 +85,10 @@ def _numbers(estimate: Estimate, first: str, second: str) -> Array:
 
 
 def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], grid: FieldGrid) -> FieldMap:
-    """Predicted disagreement of two stations about places that both see, over a grid; `station` names both.
+    """Return the predicted disagreement of two stations about places that both see, over a grid; `station` names both.
 
-    What they have in common (one field, one camera, shared boards) is taken into account, but for cameras of which is
-    known more than a normal distribution says, as where phi is followed: those count as independent.
+    What they have in common (one field, one camera, shared boards) is taken into account, except for cameras with a
+    mixture of their own, as where phi is followed: those count as independent.
 
     Raises:
         InputError: see `maps.station_keys`.
@@ -105,7 +105,7 @@ def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], gr
 def predicted(
     estimate: Estimate, posterior: Posterior, pair: tuple[str, str], places: Array, height_m: float
 ) -> tuple[Reading, Mask]:
-    """What is known of first less second about those places (N, 2) m that both see, and which (N,) these are."""
+    """Return the distribution of first minus second at the places (N, 2) m that both see, and which (N,) these are."""
     pixels = []
     for station in pair:
         station_keys(estimate, posterior, station)
@@ -120,11 +120,12 @@ def predicted(
 
 
 class Disagreement(Frozen):
-    """What two stations actually say of what both observed.
+    """The measured disagreement of two stations about what both observed.
 
     Attributes:
-        what: (N) the point, or the curve. places: (N, 2) m, about where.
-        off_mm: (N,) first less second: of a point the distance, of a stretch of a curve the sideways one, signed.
+        what: (N) the point, or the curve. places: (N, 2) m, approximately.
+        off_mm: (N,) first minus second: for a point the distance, for a stretch of a curve the signed distance across
+            it.
         expected_mm: (N,) its standard deviation, by the calibration's uncertainty and the pixels' noise.
     """
 
@@ -140,16 +141,17 @@ class Disagreement(Frozen):
 
     @property
     def expected_rms_mm(self) -> float:
-        """The same of what was expected."""
+        """Root mean square of the expected standard deviations; NaN where the two observed nothing in common."""
         return rms(self.expected_mm)
 
 
 class _Sighting(Frozen):
-    """What one station saw of one thing, all frames taken together.
+    """What one station observed of one point or stretch of a curve, averaged over all frames.
 
     Attributes:
-        place: (3,) where the thing is as drawn. off_m: (2,) by how much the station locates it elsewhere, on average.
-        noise_m: what the pixels' noise leaves in off_m, along each axis. normal: (2,) of a curve, None of a point.
+        place: (3,) m, as drawn. off_m: (2,) mean displacement of the located place from that.
+        noise_m: standard deviation of off_m by the pixels' noise, along each axis. normal: (2,) of a curve, None of a
+            point.
     """
 
     place: Array
@@ -159,7 +161,7 @@ class _Sighting(Frozen):
 
 
 _Thing = tuple[str, int]
-"""A point (its name, 0) or a stretch of a curve (its name, how many stretches from its start)."""
+"""A point (its name, 0) or a stretch of a curve (its name, the number of stretches from its start)."""
 
 
 def disagreement(
@@ -169,15 +171,15 @@ def disagreement(
     scales: tuple[float, float],
     pair: tuple[str, str],
 ) -> Disagreement:
-    """Compare what two stations say of the points, and of the stretches of curve of half a metre, that both observed.
+    """Compare where two stations locate the points, and the stretches of curve of half a metre, that both observed.
 
-    Only what lies in the world counts; how it was built does not matter, both saw the same.
+    Only what lies in the world counts. How it was built does not matter, because both saw the same.
 
     Args:
-        observations: that the calibration was made from, without those that were taken out.
+        observations: of the calibration, without those that were rejected.
         scales: noise scales of points and curves.
     """
-    fitted = Posterior(posterior.by_model or posterior.information)  # what else may be true takes up no noise
+    fitted = Posterior(posterior.by_model or posterior.information)  # alternatives absorb no noise
     a, b = (dict(_sightings(observations, estimate, station, scales)) for station in pair)
     common = [thing for thing in a if thing in b]
     places = np.array([a[thing].place for thing in common]).reshape(-1, 3)
@@ -193,7 +195,7 @@ def disagreement(
 
 
 def _gap(here: _Sighting, there: _Sighting, covariance: Array) -> tuple[float, float]:
-    """By how much the two differ and its standard deviation, m: what a fit has taken up of its own noise is missing."""
+    """Return the difference of the two and its standard deviation, m, reduced by the noise that the fit absorbed."""
     gap = here.off_m - there.off_m
     noise = (here.noise_m**2 + there.noise_m**2) * np.eye(2) - covariance
     if here.normal is None:
@@ -204,7 +206,7 @@ def _gap(here: _Sighting, there: _Sighting, covariance: Array) -> tuple[float, f
 def _sightings(
     observations: Observations, estimate: Estimate, station: str, scales: tuple[float, float]
 ) -> Iterator[tuple[_Thing, _Sighting]]:
-    """What a station saw of the points and of the stretches of curve that lie in the world."""
+    """Yield what a station observed of the points and of the stretches of curve that lie in the world."""
     fewest = 2  # observations of a stretch by each of the two stations
     bin_m = 0.5  # along a curve; observations of one stretch are taken together
     camera = estimate.camera_at(station)
@@ -232,7 +234,7 @@ def _sightings(
 
 
 def _sighting(camera: Camera, columns: Columns, rows: Indices, drawn: Array, scale: float) -> _Sighting:
-    """Some rows taken together that show what is drawn at (N, 3), all of it at one height."""
+    """Combine some rows that show what is drawn at (N, 3), all of it at one height."""
     pixels, height_m = columns.pixels[rows], float(drawn[0, 2])
     off_m = np.mean(camera.locate(pixels, height_m) - drawn[:, :2], axis=0)
     sigma_px = scale * float(np.mean(columns.sigma_px[rows])) / np.sqrt(len(rows))
@@ -240,7 +242,7 @@ def _sighting(camera: Camera, columns: Columns, rows: Indices, drawn: Array, sca
 
 
 def _rows(observations: Observations, columns: Columns, station: str) -> Iterator[tuple[Target, int, Indices]]:
-    """What a station saw of targets that lie in the world: the number of each feature, and its rows."""
+    """Yield what a station observed of targets that lie in the world: the number of each feature, and its rows."""
     rows: dict[str, list[Indices]] = {}
     for number, view in enumerate(observations.views):
         if view.station == station and view.placement is None:
@@ -253,14 +255,14 @@ def _rows(observations: Observations, columns: Columns, station: str) -> Iterato
 
 
 def _metres_per_px(camera: Camera, pixels: Array, height_m: float) -> float:
-    """Of the map about the mean of some pixels, in the mean over directions."""
-    pixel = 0.5  # for the slope of a map by differences
+    """Return metres per pixel of the map at the mean of some pixels, averaged over directions."""
+    pixel = 0.5  # step of a difference quotient
     middle = np.mean(pixels, axis=0) + pixel * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     x1, x0, y1, y0 = camera.locate(middle, height_m)
     return float(np.sqrt(0.5 * (np.sum((x1 - x0) ** 2) + np.sum((y1 - y0) ** 2)))) / (2.0 * pixel)
 
 
 def _normal(track: Array, is_arc: bool, place: Array) -> Array:
-    """(2,) across a curve, at a place on it."""
+    """(2,) unit normal of a curve, at a place on it."""
     across = place[:2] - track[0, :2] if is_arc else np.array([-track[1, 1], track[1, 0]])
     return np.asarray(across / np.linalg.norm(across))

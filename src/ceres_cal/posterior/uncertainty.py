@@ -1,7 +1,7 @@
 """How well a calibration is known, for people: numbers with verdicts, weak directions in words, maps, rigs.
 
-A number is known, weak or unknown by its standard deviation in natural sizes; a direction by what goes unnoticed along
-it.
+A number is known, weak or unknown by its standard deviation in natural sizes; a direction, by how large a change along
+it goes unnoticed.
 """
 
 from __future__ import annotations
@@ -27,28 +27,27 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 KNOWN, WEAK = 0.01, 0.3
-"""Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
-degrees), up to the second it is weak, beyond it, or with a bound that is open, unknown."""
+"""Relative standard deviations: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a
+turn to 0.6 degrees), up to the second it is weak; beyond it, or with an open bound, it is unknown."""
 CONFLICT = "in conflict"
-_GIVES_WAY = ("usual", "tolerance")  # kinds of conflict in which what was stated is not kept
-_LEARNT = 0.5  # of a tolerance's sigma: what the data must add to call the offset of a line known
-# Of the largest share: smaller ones are not named. Nothing changes from half to double.
+_GIVES_WAY = ("usual", "tolerance")  # kinds of conflicts in which the statement is not kept
+_LEARNT = 0.5  # of a tolerance's sigma: the offset of a line is known if the data determine it to this
+# Share of the largest component below which others are not named. Nothing changes from half to double.
 _IN_WORDS = 0.3
-# A ratio that is so much better known than its parts is worth a sentence. Nothing changes from half to double.
+# A ratio is mentioned if it is known better than its parts by this factor. Nothing changes from half to double.
 _TOGETHER = 0.1
 
 
 class Verdict(Frozen, eq=True):
     """What is known of one number.
 
-    Attributes:
-        key: the number. value: in the key's unit; of a turn 0, which is where the pose is.
-        sd: root mean square of what may be, infinite where unknown; where phi is followed along its profile, half the
-            distance of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural
-            size, infinite also for phi and height where the valley is open.
-        verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": everything else contradicts what
-            was stated of it, and both are within its bounds. by_profile: whether the bounds are the profile's.
-        factor: standard deviation as the data scatter over that by the model alone.
+    key: the number. value: in the key's unit; 0 for a turn, which is relative to the pose.
+    sd: root mean square deviation, infinite where unknown; where phi is followed along its profile, half the distance
+        of the bounds over the half width of an interval in sigmas. low, high: 95 % bounds, infinite where open.
+        relative: sd over the natural size, infinite also for phi and height where the valley is open.
+    verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": everything else contradicts a
+        statement about it, and both are within its bounds. by_profile: whether the bounds are the profile's.
+    factor: standard deviation with the scatter of the data, over that by the model alone.
     """
 
     key: Key
@@ -63,11 +62,11 @@ class Verdict(Frozen, eq=True):
 
 
 class WeakDirection(Frozen, eq=True):
-    """A combination of numbers that the observations hardly tell.
+    """A combination of numbers that the observations hardly determine.
 
     Attributes:
         words: one line. relative: sigma along it in natural sizes, infinite where unknown.
-        shares: key -> share, the largest one 1, of those that are not small.
+        shares: key -> share relative to the largest, which is 1; small ones are omitted.
     """
 
     words: str
@@ -85,10 +84,10 @@ def _is_set_aside(one: Conflict, value: float) -> bool:
 
 
 class Uncertainty(Frozen):
-    """How well a calibration is known. It holds as far as the model does: see `Posterior`.
+    """The uncertainty of a calibration. It is valid as far as the model is: see `Posterior`.
 
     Attributes:
-        conflicts: what was stated and everything else contradicts.
+        conflicts: statements that everything else contradicts.
     """
 
     estimate: Estimate
@@ -140,7 +139,7 @@ class Uncertainty(Frozen):
 
     @cached_property
     def undisputed(self) -> Uncertainty:
-        """Without the answers under what was stated and is set aside: those in which it is nearer than the estimate."""
+        """The uncertainty without components that are nearer to a rejected statement than to the estimate."""
         every = self.posterior.mixture()
         columns, values = {key[1:]: i for i, key in enumerate(every.keys)}, values_of(self.estimate, every.keys)
         named = [
@@ -154,14 +153,14 @@ class Uncertainty(Frozen):
         return Uncertainty(self.estimate, self.posterior.of(np.all(nearer, axis=1)), self.targets)
 
     def table(self) -> list[dict[str, Any]]:
-        """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""
+        """Return each shared number as a row of a table: `pandas.DataFrame(known.table())`."""
         return [
             {**one.key._asdict(), **{name: getattr(one, name) for name in ("value", "sd", "low", "high", "verdict")}}
             for one in self.verdicts
         ]
 
     def verdict(self, kind: str, owner: str, quantity: str) -> Verdict:
-        """Of one number.
+        """Return the verdict on one number.
 
         Raises:
             InputError: it is not a free number.
@@ -170,11 +169,11 @@ class Uncertainty(Frozen):
 
     @cached_property
     def weak_directions(self) -> tuple[WeakDirection, ...]:
-        """What is hardly known, in words: directions, weakest first, along which sigma exceeds KNOWN in natural sizes,
-        each that words tell from the rest; neither structure nor the nodes of a lens's surface are looked at.
+        """Directions along which sigma exceeds KNOWN in natural sizes, in words, weakest first. Directions with the
+        same words appear once; structure and the nodes of a lens's surface are not included.
 
-        Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes
-        some number by more than a hundredth of itself.
+        Natural sizes make units irrelevant: a direction is weak if an unnoticed change along it changes some number by
+        more than a hundredth of itself.
         """
         posterior = self.posterior
         nodes = {(name, quantity) for name, camera in self.estimate.cameras.items() for quantity in camera.lens.nodes}
@@ -215,7 +214,7 @@ class Uncertainty(Frozen):
 
     @cached_property
     def unknown_placements(self) -> dict[str, tuple[str, ...]]:
-        """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
+        """Placements with unknown numbers, and which these are, such as the roll of a ring sheet about its axis."""
         posterior = self.posterior
         unknown: dict[str, tuple[str, ...]] = {}
         every = list(posterior.placements.values())
@@ -238,15 +237,16 @@ class Uncertainty(Frozen):
 
     @property
     def widening(self) -> str:
-        """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
-        widened = 1.1  # factor on standard deviations that is worth a word
+        """One line on why standard deviations are larger than by the model alone; "" where they are not."""
+        widened = 1.1  # factor on standard deviations from which on it is mentioned
         dependence, factor = self.posterior.dependence, median(self.posterior.factors)
         if dependence is None or not dependence.causes or factor < widened:
             return ""
         return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
     def ratio_sd(self, station: str) -> float:
-        """Relative standard deviation of phi over the station's height: what a view from straight above does tell.
+        """Relative standard deviation of phi over the station's height: a view from straight above determines this
+        ratio.
 
         Raises:
             InputError: one of them was held.
@@ -258,7 +258,7 @@ class Uncertainty(Frozen):
         return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
     def located(self, pixels: ArrayLike, height_m: float = 0.0, station: str | None = None) -> PointSpread:
-        """Pixels (N, 2) located at a height, with 95 % bounds.
+        """Locate pixels (N, 2) at a height, with 95 % bounds.
 
         Raises:
             InputError: see `map_sd_mm`.
@@ -273,7 +273,7 @@ class Uncertainty(Frozen):
         x_m: ArrayLike | None = None,
         y_m: ArrayLike | None = None,
     ) -> FieldMap:
-        """How well a station locates points at a height, over a grid; by default one over the field.
+        """Return how well a station locates points at a height, over a grid; by default one over the field.
 
         Raises:
             InputError: no such station, none named where there are several, or it was held as the world.
@@ -283,7 +283,7 @@ class Uncertainty(Frozen):
         return self._kept(make, (name, height_m)) if x_m is None and y_m is None else make()
 
     def map_px(self, camera: str | None = None) -> ImageMap:
-        """How well a camera knows its image, px, whatever its pose.
+        """Return how well a camera knows its image, px, independently of its pose.
 
         Raises:
             InputError: no such camera, or none named where there are several.
@@ -295,7 +295,7 @@ class Uncertainty(Frozen):
         return self._kept(partial(image_map, self.estimate, self.posterior, camera), camera)
 
     def _kept(self, make: Callable[[], T], of: Hashable) -> T:
-        """A map as it was made first: along a valley it takes a second, and three chapters of a report read it."""
+        """Return a map, computed once: along a valley it takes a second, and three chapters of a report use it."""
         if of not in self._maps:
             self._maps[of] = make()
         kept: T = self._maps[of]
@@ -308,7 +308,7 @@ class Uncertainty(Frozen):
     def seam_sd_mm(
         self, first: str, second: str, height_m: float = 0.0, x_m: ArrayLike | None = None, y_m: ArrayLike | None = None
     ) -> FieldMap:
-        """By how much two stations may disagree about places that both see.
+        """Return how much two stations may disagree about places that both see.
 
         Raises:
             InputError: see `map_sd_mm`.
@@ -318,10 +318,10 @@ class Uncertainty(Frozen):
         return seam_map(self.estimate, self.posterior, (first, second), self._grid(height_m, x_m, y_m))
 
     def _grid(self, height_m: float, x_m: ArrayLike | None, y_m: ArrayLike | None) -> FieldGrid:
-        """A grid over the box around what does not move, where x and y are not given.
+        """Return a grid; where x and y are not given, over the box around the targets that do not move.
 
         Raises:
-            InputError: there is nothing that does not move.
+            InputError: there is no such target.
         """
         field = field_grid(self.targets) if x_m is None or y_m is None else ()
         x, y = (field[axis] if given is None else given for axis, given in enumerate((x_m, y_m)))
@@ -329,10 +329,10 @@ class Uncertainty(Frozen):
 
 
 def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
-    """x and y of a grid over the box around what does not move.
+    """Return x and y of a grid over the box around the targets that do not move.
 
     Raises:
-        InputError: there is nothing that does not move.
+        InputError: there is no such target.
     """
     grid = 36  # steps along the longer side
     box = [target.box for target in still(targets).values()]
