@@ -1,8 +1,9 @@
-"""Which numbers there are, what is minimised, and the one solve.
+"""The free numbers, the function that is minimised, and the one solve.
 
-The only package that imports pyceres. Placements that a single station sees are eliminated inside one block per camera,
-over its free intrinsics alone; every other sight is one compressed block over its camera's free intrinsics, its station
-and its placement; each prior is one small block. What Ceres minimises is the same function either way.
+This is the only package that imports pyceres. Placements that a single station sees are eliminated within one block per
+camera, which depends only on the camera's free intrinsics. Every other sight is one compressed block over its camera's
+free intrinsics, its station and its placement. Each prior is one small block. Ceres minimises the same function either
+way.
 """
 
 from ceres_cal.base import kept_signals, names_of

@@ -1,4 +1,4 @@
-"""The one nonlinear least-squares problem: its blocks, the solve and what comes out."""
+"""The one nonlinear least-squares solve: its blocks, its settings and its result."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ceres_cal.problem.problem import Problem, Weighting
 
 _NOTHING_LEFT = "Nothing left to gain."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
-# Relative change of a placement's cost that a start may leave. Nothing changes from half to double.
+# Relative change of a placement's cost that an initial estimate may leave. Halving or doubling changes nothing.
 _POSED = 1e-2
 
 
 class Progress(Frozen, eq=True):
-    """One iteration of a solve, as the progress callback gets it."""
+    """One iteration of a solve, as passed to the progress callback."""
 
     iteration: int
     cost: float
@@ -32,16 +32,16 @@ class Progress(Frozen, eq=True):
 
 
 SolveProgress = Callable[[Progress], None]
-"""Called at every iteration of every solve."""
+"""A function that is called at every iteration of every solve."""
 
 
 class Solution(Frozen, eq=True):
-    """The end of one solve.
+    """The result of one solve.
 
     Attributes:
-        cost: half the sum of all rho, at the end, infinite where it failed. history: the same at every iteration.
-        converged: False when the iterations ran out or the solver failed; termination: Ceres' own words why it stopped.
-        failed: the estimate is where it started.
+        cost: half the sum of all rho at the end; infinite where the solve failed. history: the cost at every iteration.
+        converged: False if the iterations ran out or the solver failed. termination: Ceres' message why it stopped.
+        failed: whether the solve failed; the estimate is then the initial one.
     """
 
     estimate: Estimate
@@ -56,7 +56,7 @@ class Solution(Frozen, eq=True):
 
 
 def packed(estimate: Estimate, layout: Layout, eliminated: frozenset[str | None]) -> dict[Owner, Array]:
-    """The arrays that Ceres moves; the caller's estimate is never touched."""
+    """The arrays that Ceres moves, as copies: the caller's estimate is never changed."""
     cameras = {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()}
     stations = {n: station.cam_from_world.log() for n, station in estimate.stations.items() if n in layout.stations}
     kept = layout.placements - eliminated
@@ -82,7 +82,7 @@ def _unpacked(blocks: Mapping[Owner, Array], estimate: Estimate, layout: Layout)
 
 
 def _costs_of(run: Run, problem: Problem, estimate: Estimate) -> tuple[list[CachedCost], int]:
-    """Every cost of a problem, and how many blocks are worth a thread each."""
+    """All cost functions of a problem, and the number of threads that they are worth."""
     private, sights, layout = problem.private, problem.sights, problem.layout
     eliminated, threads, stated = list[EliminatedCost](), 1, problem.stated_at(estimate)
     for camera in estimate.cameras:
@@ -107,7 +107,7 @@ def _costs_of(run: Run, problem: Problem, estimate: Estimate) -> tuple[list[Cach
 
 
 class _Watcher(pyceres.IterationCallback):
-    """Passes progress on; ends the solve when nothing is left to gain, a callback has failed or Ctrl-C was pressed."""
+    """Pass progress on; end the solve if nothing is left to gain, if a callback has failed, or on Ctrl-C."""
 
     def __init__(self, run: Run, progress: SolveProgress | None, precision: float) -> None:
         super().__init__()
@@ -129,9 +129,9 @@ class _Watcher(pyceres.IterationCallback):
 
 
 def _left_to_gain(costs: Sequence[float]) -> float:
-    """The share of the cost that all further steps bring if the gains go on shrinking as the last two did.
+    """The share of the cost that all further steps will gain if gains go on shrinking as the last two did.
 
-    Ceres waits for a gain of nothing, which near the end of Newton's way is an iteration in vain.
+    Ceres itself stops only when a step gains nothing, which near the end of Newton's method wastes an iteration.
     """
     if len(costs) < 3:
         return np.inf
@@ -143,7 +143,7 @@ def _left_to_gain(costs: Sequence[float]) -> float:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Ceres keeps to its summary: what it would print besides says no more."""
+    """Silence Ceres: what it prints says no more than its summary."""
     before = pyceres.logging.minloglevel
     pyceres.logging.minloglevel = int(pyceres.logging.FATAL)
     try:
@@ -153,7 +153,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _parts(sight: Sights) -> list[Sights]:
-    """A sight of very many observations as one for each thread."""
+    """The parts of a sight, one for each thread; a sight of few observations is one part."""
     count = max(1, min(available(), (len(sight.points) + len(sight.curve_pixels)) // ROWS_WORTH_A_THREAD))
     return [sight.part(number, count) for number in range(count)] if count > 1 else [sight]
 
@@ -167,13 +167,14 @@ def solve(
     is_near: bool = True,
     posed: float = 0.0,
 ) -> Solution:
-    """Minimise the robust cost over everything free, from `estimate`.
+    """Minimise the robust cost over everything free, starting from `estimate`.
 
     Args:
         progress: called at every iteration. precision: relative change of the cost at which the solve ends.
-        is_near: whether the estimate is near the minimum. There plain Gauss-Newton is right where the loss is convex,
-            and phi against height creeps without it.
-        posed: to which share of its cost each private placement is at its best before the first step; 0: it stays.
+        is_near: whether the estimate is near the minimum. There plain Gauss-Newton is right if the loss is convex;
+            without it, convergence along phi and height is slow.
+        posed: relative change of its cost to which each private placement is solved for before the first step; 0 leaves
+            it unchanged.
 
     Raises:
         DegenerateError: fewer observations than free numbers.
@@ -188,12 +189,12 @@ def solve(
         cost.charts = charts
         if posed and isinstance(cost, EliminatedCost):
             cost.posed(posed)
-        if cost.owners:  # else it depends on nothing free
+        if cost.owners:  # otherwise it depends on nothing that is free
             ceres.add_residual_block(cost, None, [blocks[owner] for owner in cost.owners])
     for owner, chart in charts.items():
         blocks[owner][:] = chart.moved(blocks[owner])
     settings = _solver_options(problem, blocks, precision)
-    # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.
+    # Kernels end sooner than a thread gets Python's lock; only parts of very large sights are worth a thread each.
     settings.num_threads = threads
     settings.callbacks = [_Watcher(run, progress, precision)]
     if is_near and problem.weighting.is_convex:
@@ -226,11 +227,11 @@ def solve(
 def placement_costs(
     sights: Sights, estimate: Estimate, weighting: Weighting, poses: Array, tolerance: float = 1e-6
 ) -> tuple[Array, Array]:
-    """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after each placement alone was solved for.
+    """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after solving for each placement alone.
 
     Args:
-        poses: (S, 3, 4) where the search for each cam_from_target starts; a start from where an observation cannot be
-            projected costs infinity. tolerance: relative, of each cost.
+        poses: (S, 3, 4) initial cam_from_target of each; the cost is infinite if an observation cannot be projected
+            from there. tolerance: relative, of each cost.
     """
     held = Layout({sights.keys[0].camera: np.empty(0, dtype=np.int64)}, frozenset(), frozenset())
     problem = Problem(sights, held, weighting=weighting)
@@ -238,7 +239,9 @@ def placement_costs(
 
 
 def with_placements_at_best(problem: Problem, estimate: Estimate, tolerance: float = _POSED) -> Estimate:
-    """The estimate with every private placement where it fits best, everything else held: to a share of its cost."""
+    """The estimate with every private placement solved for, everything else held; `tolerance`: relative, of its
+    cost.
+    """
     for camera in estimate.cameras:
         own = problem.sights.take(problem.sights.numbers(camera, placements=problem.private))
         if len(own):
@@ -249,8 +252,8 @@ def with_placements_at_best(problem: Problem, estimate: Estimate, tolerance: flo
 
 
 def _rests(history: Sequence[float]) -> bool:
-    """Whether the last iterations changed the cost by rounding alone: a redescending loss can go on like that."""
-    at_rest = 10  # iterations
+    """Whether the last iterations changed the cost only by rounding: a redescending loss may go on like that."""
+    at_rest = 10  # number of these iterations
     last = history[-at_rest:]
     return len(last) == at_rest and max(last) - min(last) <= 1e-11 * max(last)
 
@@ -274,9 +277,9 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
 
 
 def _solver_options(problem: Problem, blocks: Mapping[Owner, Array], precision: float) -> Any:
-    dense_limit = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
-    dense_blocks = 2000  # of few full blocks: of two with 850 a sparse step takes half a minute, a dense one .1 s
-    most_invalid = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
+    dense_limit = 600  # numbers left after the Schur complement, above which a sparse factorisation is faster
+    dense_blocks = 2000  # numbers below which few full blocks are dense: two of 850 take .1 s, sparse half a minute
+    most_invalid = 20  # consecutive invalid steps: the trust region shrinks ever faster, and no pose lies beyond
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in problem.layout.free.values()) + len(blocks[STRUCTURE])
     left = kept + 6 * len(problem.layout.stations)

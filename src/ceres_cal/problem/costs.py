@@ -1,6 +1,6 @@
 """Cost functions of the observations and of priors.
 
-What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++.
+Ceres calls them. They keep the last value, and an exception ends the solve instead of passing through C++.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from ceres_cal.problem.structure import Structure
 
 @dataclass(eq=False)
 class Run:
-    """What the callbacks of one solve share: the first exception in any of them (Ctrl-C too) ends the solve.
+    """The state that the callbacks of one solve share: the first exception in any of them, also Ctrl-C, ends the solve.
 
-    A context, in which each callback works: what is raised there is raised again when Ceres has returned.
+    It is a context manager in which each callback works. An exception is raised again when Ceres has returned.
     """
 
     failure: BaseException | None = None
@@ -44,7 +44,9 @@ class Run:
 
 
 class CostValue(NamedTuple):
-    """The residuals (N,) in a place, and the flat Jacobians (N, size) of each block there."""
+    """The parameters `at` which a cost was evaluated, the residuals (N,), and the flat Jacobian (N, size) by each
+    block.
+    """
 
     at: Array
     residuals: Array
@@ -52,18 +54,20 @@ class CostValue(NamedTuple):
 
 
 Evaluated = Callable[[Array, Sequence[Array]], CostValue]
-"""What answers in a place, whole and by blocks."""
+"""A function of all parameters, given as one vector and by blocks, that returns a cost value."""
 
-CostFunction: Any = pyceres.CostFunction  # which has no types
+CostFunction: Any = pyceres.CostFunction  # pyceres has no types
 
 
 class CachedCost(CostFunction):
-    """A cost function; what it costs is `evaluated`: the answer in a place, whole and by blocks; None where an
-    observation cannot be projected from there. pyceres' metaclass lets no class with abstract methods join.
+    """A cost function that keeps its last value.
+
+    `evaluated`, given all parameters as one vector and by blocks, returns the value, or None where an observation
+    cannot be projected. It is no abstract method, because pyceres' metaclass does not permit any.
 
     Attributes:
-        owners: whose blocks the solver hands over; the others are held.
-        charts: of the owners whose numbers Ceres does not move as they are.
+        owners: the owners of the blocks that the solver passes; all other numbers are held.
+        charts: for owners whose numbers Ceres moves in other coordinates.
     """
 
     evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
@@ -77,7 +81,7 @@ class CachedCost(CostFunction):
         self._known: CostValue | None = None
 
     def _take(self, sizes: Mapping[Owner, int], residuals: int) -> None:
-        """Tell Ceres of the blocks, of so many numbers each, and of the residuals."""
+        """Set the sizes of the parameter blocks, by owner, and the number of residuals."""
         self.owners = list(sizes)
         self.set_num_residuals(residuals)
         self.set_parameter_block_sizes(list(sizes.values()))
@@ -87,7 +91,8 @@ class CachedCost(CostFunction):
             charts = [self.charts.get(owner) for owner in self.owners]
             blocks = [chart.numbers(one) if chart else one for chart, one in zip(charts, parameters, strict=True)]
             at = np.concatenate(blocks)
-            # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
+            # Ceres asks for the cost of a step first, then for the Jacobian at the same point: one evaluation is
+            # enough.
             if self._known is None or self._known.at.tobytes() != at.tobytes():
                 self._known = self.evaluated(at, blocks)
             if self._known is None:
@@ -103,19 +108,19 @@ class CachedCost(CostFunction):
         return False
 
     def _accept(self) -> None:
-        """Jacobians are asked for where a step was accepted, and nowhere else."""
+        """Accept the last point: Ceres asks for Jacobians only where it has accepted a step."""
 
 
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
-"""That an observation's share of the normal equations takes."""
-# Of a sight's cost, by the step its pose would take: the complement takes that along exactly, to second order. From
-# half to double the answer moves by under 1 % of its error.
+"""Time (ns) that the normal equations take for each observation."""
+# Share of a sight's cost that its pose may still gain: the Schur complement includes such a step exactly, to second
+# order. Halving or doubling moves the answer by less than 1 % of its error.
 _LEFT_TO_THE_COMPLEMENT = 1e-2
 
 
 class _SightsCost(CachedCost):
-    """What sights of one camera cost."""
+    """The cost of sights of one camera."""
 
     def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
@@ -151,7 +156,7 @@ class SightCost(_SightsCost):
         self._take(taken, len(free) + self._unknowns.structure + 7)
 
     def block(self, parameters: Sequence[Array]) -> Array | None:
-        """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
+        """(N, K + 1) the Jacobians side by side, then the residuals; None where an observation cannot be projected."""
         known = self.evaluated(kernels.NOTHING, parameters)
         if known is None:
             return None
@@ -176,20 +181,20 @@ class SightCost(_SightsCost):
 
 
 def kernel_loss(weighting: Weighting) -> kernels.Loss:
-    """The loss as the kernels take it."""
+    """The loss in the form that the kernels take."""
     return kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
 
 
 def robust_weights(weighting: Weighting, squared: Array) -> Array:
-    """(N,) the weight rho' that each squared residual has in the solve."""
+    """(N,) the weight rho' of each squared residual in the solve."""
     weights = np.empty(len(squared))
     kernels.loss_weights(kernel_loss(weighting), squared, weights)
     return weights
 
 
 class _Evaluation(Frozen):
-    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`), and
-    how long the step to it was, in standard deviations.
+    """The value of an EliminatedCost: its numbers `at`, what Ceres receives, poses and gains (see `kernels.Sweep`), and
+    the length of the step to it, in standard deviations.
     """
 
     at: Array
@@ -201,8 +206,8 @@ class _Evaluation(Frozen):
 
 
 class EliminatedCost(_SightsCost):
-    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure; and
-    what is stated of these intrinsics: as blocks of their own Ceres would take as long over that as over all sights.
+    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure, with
+    the priors on these intrinsics: as separate blocks, these would take Ceres as long as all sights.
     """
 
     def __init__(
@@ -212,10 +217,11 @@ class EliminatedCost(_SightsCost):
         free, count = self._unknowns.free, len(self._structure.values)
         self._size = len(free) + count
         start = np.concatenate([self._optics.intrinsics[free], self._structure.values])
-        # The kernels speak of offsets alone; (size + 1, size + 1) but for that.
+        # The kernels know only offsets; without dimensions among the numbers it is the unit matrix of size + 1.
         self._chain, lead = self._structure.chain(len(free), 1), len(free) + self._unknowns.structure
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
-        # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
+        # Every step starts from the poses of the last accepted one: a rejected step may have moved them to another
+        # minimum.
         self._accepted = _Evaluation(start, kernels.NOTHING, np.zeros((1, self._size)), poses, gains)
         self._last = self._accepted
         self._smooth, self._stated = _smoothness(problem, estimate, self.camera, self._size), stated
@@ -237,11 +243,11 @@ class EliminatedCost(_SightsCost):
         self._accepted = self._last
 
     def _followed(self, at: Array, along: Array, step: float) -> _Evaluation | None:
-        """Where so short a step from the last accepted place leads by that one's equations; None where more than
-        rounding may be missing, as long as steps shrink no slower than they did, where it is not all that these
-        equations ask for, or led there already.
+        """The value after a step so short that the equations of the last accepted point predict it. None if more than
+        rounding may be missing, assuming that steps shrink as fast as they did; if the step is not all that these
+        equations ask for; or if the last value was predicted already.
         """
-        nothing, before = 1e-6, self._accepted  # standard deviations
+        nothing, before = 1e-6, self._accepted  # standard deviations that count as rounding
         if step * step >= nothing * (before.step - step):
             return None
         residuals = before.residuals + along
@@ -250,7 +256,7 @@ class EliminatedCost(_SightsCost):
         return replace(before, at=at, residuals=residuals, poses=self._swept(at, np.inf).poses, step=0.0)
 
     def _eliminated(self, at: Array, tolerance: float, step: float = 0.0) -> _Evaluation | None:
-        """The cost in a place, or None where an observation cannot be projected from there."""
+        """The value with placements eliminated; None where an observation cannot be projected."""
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
             swept = self._swept(at, tolerance, newton)
@@ -260,14 +266,14 @@ class EliminatedCost(_SightsCost):
             kernels.cholesky(swept.reduced, upper)
             residuals = upper[:, -1].copy()
             missing = cost - float(residuals[:-1] @ residuals[:-1])
-            if missing > -kernels.ROUNDING * cost:  # else Newton's step promises more than there is
+            if missing > -kernels.ROUNDING * cost:  # otherwise Newton's step promises more than the cost
                 break
         residuals[-1] = np.sqrt(max(missing, 0.0))
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains, step)
 
     def _add_known(self, at: Array, reduced: Array) -> float:
-        """What is stated of the camera and its lens's roughness cost, once their normal equations are added."""
+        """Add the normal equations of priors on the camera and of its lens's roughness; return their cost."""
         cost, numbers = 0.0, at[: len(self._unknowns.free)]
         if self._smooth is not None:
             slope = self._smooth @ at
@@ -282,7 +288,7 @@ class EliminatedCost(_SightsCost):
         return cost
 
     def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
-        """Every placement brought to its best in a place, from the last accepted one."""
+        """Solve for every placement at the given numbers, starting from the last accepted poses."""
         free = self._unknowns.free
         intrinsics = self._optics.intrinsics.copy()
         intrinsics[free] = at[: len(free)]
@@ -303,8 +309,8 @@ class EliminatedCost(_SightsCost):
         return kernels.Sweep(poses, gains, costs, reduced if chain is None else chain.T @ reduced @ chain)
 
     def posed(self, tolerance: float, poses: Array | None = None) -> tuple[Array, Array]:
-        """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts where it is, or
-        from `poses`, everything else held; an infinite cost where a start cannot be seen.
+        """Costs (S,) and poses (S, 3, 4) after solving for each placement, with everything else held, starting from the
+        present poses or from `poses`; the cost is infinite where a start cannot be projected.
         """
         poses = self._accepted.poses if poses is None else poses
         self._accepted = replace(self._accepted, poses=poses, gains=np.zeros_like(self._accepted.gains))
@@ -315,14 +321,14 @@ class EliminatedCost(_SightsCost):
     def converged(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
         at = np.concatenate([kernels.NOTHING, *parameters])
-        # At rest they have come to rest as well; elsewhere, or where Ceres had nothing to move, they are sought.
+        # At the accepted point they have converged as well; elsewhere, or if Ceres had nothing to move, they are found.
         if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
             self._accepted = self._eliminated(at, 1e-14) or self._accepted
         return self._sights.keys, self._accepted.poses
 
 
 def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> Array | None:
-    """(size, size) what is known of a lens's roughness, by the numbers of its camera's block; None of nothing."""
+    """(size, size) prior information on a lens's roughness, over its camera's block; None if there is none."""
     camera, whole = estimate.cameras[name], None
     place = {number: at for at, number in enumerate(problem.layout.free[name].tolist())}
     for prior in problem.smooth_at(estimate, name):
@@ -333,22 +339,22 @@ def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> A
     return whole
 
 
-# ---- a prior's block: root (x - mean) over every camera, station and structure number that it speaks of ------------
+# ---- a prior's block: root (x - mean) over every camera, station and structure number that it is about -------------
 
 _Coordinates = Callable[[Array], tuple[Array, Array]]
-"""(n,) what a prior speaks of in a solver's block, in the units of its keys, and (n, size) derivatives by the block."""
+"""A function of a solver's block: (n,) a prior's numbers, in the units of its keys, and (n, size) their derivatives."""
 
 
 def _linear(slots: Sequence[int], scales: Array, size: int) -> _Coordinates:
-    """Numbers that stand in the block themselves."""
+    """Coordinates that are numbers of the block itself, times scales."""
     slopes = np.zeros((len(slots), size))
     slopes[np.arange(len(slots)), slots] = scales
     return lambda block: (block[slots] * scales, slopes)
 
 
 def _of_station(rows: Sequence[int], rotation: Array) -> _Coordinates:
-    """A station's position, and its turn from the prior's rotation about its own axes, of a rotation vector and a
-    translation.
+    """Coordinates of a station, whose block is a rotation vector and a translation: its position, and its turn, from
+    the prior's rotation, about its own axes.
     """
 
     def coordinates(block: Array) -> tuple[Array, Array]:
@@ -364,7 +370,7 @@ def _of_station(rows: Sequence[int], rotation: Array) -> _Coordinates:
 
 
 class PriorCost(CachedCost):
-    """root (x - mean), in standard deviations, of a prior on free numbers alone."""
+    """The cost of a prior on free numbers only: root (x - mean), in standard deviations."""
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
         super().__init__(run)
@@ -390,8 +396,8 @@ class PriorCost(CachedCost):
 
 
 def _bent(residuals: Array) -> tuple[Array, Array]:
-    """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
-    least = 1e-12  # over where it bends: Cauchy's loss leaves that as it is
+    """(R,) residuals whose squares are Cauchy's loss of the given ones, each separately, and their derivatives."""
+    least = 1e-12  # ratio to the bend of the loss, below which Cauchy's loss is the square itself
     squares = np.maximum((residuals / USUAL_BENDS) ** 2, least**2)
     lengths = np.sqrt(np.log1p(squares))
     return USUAL_BENDS * np.copysign(lengths, residuals), np.sqrt(squares) / (lengths * (1.0 + squares))
@@ -400,7 +406,7 @@ def _bent(residuals: Array) -> tuple[Array, Array]:
 def _parts(
     prior: GaussianPrior, estimate: Estimate, layout: Layout
 ) -> Iterator[tuple[Owner, int, list[int], _Coordinates]]:
-    """The blocks that a prior depends on: owner, size, columns of the prior, and what stands there."""
+    """The blocks on which a prior depends: owner, size, columns of the prior, and coordinates."""
     for (kind, owner), columns in columns_by_owner(prior.keys).items():
         quantities = [prior.keys[column].quantity for column in columns]
         if kind == "camera":

@@ -1,6 +1,6 @@
-"""Where shares of very many observations are asked: here, by a thread each, or on workers that Dask has.
+"""Engines that query shares of very many observations: in this process, with a thread each, or on Dask's workers.
 
-What the solve and its information see of them: a cost function and normal equations, sums of what the shares answer.
+The solve and its information see a cost function and normal equations: sums of the answers of the shares.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.shares import Share, ShareRequest
 
 _A = TypeVar("_A")
-_RETRIES = 3  # of what a worker that was lost had to do
-_PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
+_RETRIES = 3  # of the work of a worker that was lost
+_PAUSE_S = 0.05  # before the work of a lost worker is repeated, four times as long each time
 _NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
 _NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
 
 
 class InProcess:
-    """Shares that this process asks, a thread for each group."""
+    """Shares in this process, with a thread for each group."""
 
     def __init__(self, shares: Sequence[Share]) -> None:
         self._groups = _groups_of(shares)
@@ -41,15 +41,15 @@ class InProcess:
         return reduce(add, asked_of(self._groups, answer, request, available()))
 
     def close(self) -> None:
-        """Let the shares go."""
+        """Release the shares."""
         self._groups = []
 
 
 def _groups_of(shares: Sequence[Share], workers: int = 1) -> list[Sequence[Share]]:
-    """Consecutive shares that are added up by themselves, where they are: the same ones for any number of workers up
-    to so many, and so are all sums, to the last bit.
+    """Groups of consecutive shares, each summed by itself in one place. They are the same for up to `groups` workers,
+    and so are all sums, to the last bit.
     """
-    groups = 16  # workers up to which sums are the same to the last bit; what is sent for each answer grows with it
+    groups = 16  # workers up to which sums are the same to the last bit; the data sent for each answer grow with it
     count = min(len(shares), max(groups, workers))
     return [shares[len(shares) * n // count : len(shares) * (n + 1) // count] for n in range(count)]
 
@@ -57,7 +57,7 @@ def _groups_of(shares: Sequence[Share], workers: int = 1) -> list[Sequence[Share
 def asked_of(
     groups: Sequence[Sequence[Share]], answer: Callable[..., _A], request: Sequence[Any], threads: int
 ) -> list[_A]:
-    """The sum of answer(share, *request) over the shares of each group, by so many threads."""
+    """The sum of answer(share, *request) over the shares of each group, with the given number of threads."""
 
     def one(group: Sequence[Share]) -> _A:
         with at_most(1):
@@ -74,17 +74,19 @@ def asked_of(
 
 
 class OnWorkers:
-    """Shares that the workers of a `distributed.Client` keep, one after the other each; one that is lost is made again.
+    """Shares kept by the workers of a `distributed.Client`, which each go through theirs one by one; lost ones are
+    remade.
 
-    They are kept by tasks, which Dask does again elsewhere, and asked past its scheduler, which takes ten milliseconds.
+    They are kept by tasks, which Dask repeats elsewhere if a worker is lost. Requests bypass its scheduler, which would
+    take ten milliseconds for each.
 
     Raises:
-        SolutionError: a worker ran out of memory or disk, or was lost again and again; it is named.
+        SolutionError: a worker ran out of memory or disk, or workers were lost repeatedly; it is named.
     """
 
     def __init__(self, client: Any, shares: Sequence[Share]) -> None:
         self._client = client
-        # Not scheduler_info(): between its question and its answer the client's own poll may empty what it returns.
+        # scheduler_info() cannot be used: the client's own poll may empty its result before it is read.
         workers = sorted(client.nthreads())
         if not workers:
             raise SolutionError("the scheduler has no workers: start some with `dask worker ADDRESS`")
@@ -96,11 +98,11 @@ class OnWorkers:
             for n, group in enumerate(groups)
         ]  # fmt: skip
         self._places = self._found()
-        # From now on anywhere: a task that is to be done by a worker that is gone waits for ever.
+        # From now on any worker may keep a group: a task bound to a worker that is gone would wait for ever.
         client.sync(client.scheduler.set_restrictions, worker={one.key: None for one in self._kept})
 
     def _found(self) -> dict[str, list[int]]:
-        """Numbers of the groups that each worker keeps, once all are kept."""
+        """The numbers of the groups that each worker keeps, once all are kept."""
         for one in self._kept:
             if (error := one.exception()) is not None:
                 raise _in_words(error)
@@ -128,7 +130,7 @@ class OnWorkers:
             for worker, reply in replies.items():
                 if isinstance(reply, dict):
                     answers |= reply
-                elif not isinstance(reply, (OSError, KeyError)):  # else the worker or what it kept is lost
+                elif not isinstance(reply, (OSError, KeyError)):  # these mean that the worker or its group is lost
                     raise _in_words(reply)
                 else:
                     last = worker
@@ -137,20 +139,20 @@ class OnWorkers:
         raise _lost(last)
 
     def close(self) -> None:
-        """Let the shares go."""
+        """Release the shares."""
         for one in self._kept:
             one.release()
 
 
 def _kept(group: Sequence[Share]) -> Sequence[Share]:
-    """What a worker keeps."""
+    """The task by which a worker keeps a group."""
     return group
 
 
 async def _answered(
     asked: Mapping[str, Mapping[int, str]], answer: Callable[..., _A], request: Sequence[Any], dask_worker: Any
 ) -> dict[int, _A] | CalibrationError:
-    """What the groups answer that are asked of this worker, by number; what stops it, and where."""
+    """The answers of this worker's groups, by number; or the error that stopped it, with its name."""
     keys = asked[dask_worker.address]
     groups = [dask_worker.data[key] for key in keys.values()]
 
@@ -167,8 +169,8 @@ async def _answered(
 
 
 def _named(error: Exception, worker: str, folder: str) -> CalibrationError:
-    """What a worker ran into, with its name."""
-    if isinstance(error, InputError):  # of a file
+    """A worker's error, with the worker's name."""
+    if isinstance(error, InputError):  # raised when a file is read
         return InputError(f"{error} (worker {worker})")
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -178,7 +180,7 @@ def _named(error: Exception, worker: str, folder: str) -> CalibrationError:
 
 
 def _in_words(error: BaseException) -> BaseException:
-    """What a worker raised, in one line where that is known."""
+    """An error raised by a worker, as one line where its cause is known."""
     if isinstance(error, MemoryError):
         return SolutionError(_NO_MEMORY)
     if type(error).__name__ in ("KilledWorker", "FutureCancelledError", "CancelledError"):
@@ -192,7 +194,7 @@ def _lost(last: str) -> SolutionError:
 
 
 class SharedObservations(Frozen):
-    """The observations of an engine's shares, judged at an estimate; see `problem.RemoteObservations`."""
+    """The observations in an engine's shares, judged at an estimate; see `problem.RemoteObservations`."""
 
     engine: InProcess | OnWorkers
     keys: tuple[SightKey, ...]
@@ -202,13 +204,13 @@ class SharedObservations(Frozen):
     feet_along: tuple[tuple[str, Estimate], ...]
 
     def asked(self, problem: Problem, estimate: Estimate) -> ShareRequest:
-        """What the shares are asked about a problem at an estimate."""
+        """The request to the shares about a problem at an estimate."""
         return ShareRequest(
             of_world(estimate), problem.layout, problem.weighting, self.judged_at, self.bounds, self.feet_along
         )
 
     def cost(self, run: Run, problem: Problem, estimate: Estimate) -> SharedCost:
-        """What Ceres sees of them."""
+        """Their cost function for Ceres."""
         return SharedCost(run, self, problem, estimate)
 
     def normals(self, problem: Problem, estimate: Estimate) -> Mapping[tuple[SightKey, int], Array]:
@@ -217,7 +219,7 @@ class SharedObservations(Frozen):
 
 
 class SharedCost(CachedCost):
-    """The compressed blocks of all sights of the shares: a round trip for each place that Ceres looks at."""
+    """The compressed blocks of all sights of the shares, with one round trip for each evaluation by Ceres."""
 
     def __init__(self, run: Run, judged: SharedObservations, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
@@ -247,7 +249,7 @@ class SharedCost(CachedCost):
         return CostValue(at, residuals, [jacobian[:, columns].reshape(-1) for columns in self._columns.values()])
 
     def _columns_of(self, key: SightKey) -> Indices:
-        """Columns of the numbers that a sight depends on."""
+        """The columns of the numbers that a sight depends on."""
         return np.concatenate([np.empty(0, np.int64), *(self._columns[owner] for owner in self._of[key])])
 
 

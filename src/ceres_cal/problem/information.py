@@ -1,13 +1,13 @@
-"""Information with named keys: what is known of some numbers together, the inverse of a covariance if there is one.
+"""Information with named keys: joint knowledge of some numbers, the inverse of a covariance if there is one.
 
-Information adds up; numbers that are held are struck out, numbers that are not asked about are integrated out. Nothing
-is inverted where nothing is known.
+Information is added. Numbers that are held are struck out, numbers of no interest are integrated out. Nothing is
+inverted where nothing is known.
 
-Names of the numbers that a calibration is about, each with an owner and a unit.
+Also the keys: names of the numbers of a calibration, each with an owner and a unit.
 
-Intrinsics are in the units of the files. A pose has a position in the world (m) and three turns (rad): of a station
-about the camera's own axes (x right, y down, z forward), of a placement about the target's own. Turns are small angles
-from where the pose is, so no pose is special, not even one turned by half a turn.
+Intrinsics are in the units of the files. A pose has a position in the world (m) and three turns (rad): those of a
+station are about the camera's own axes (x right, y down, z forward), those of a placement about the target's own axes.
+Turns are small angles from the present pose, so that no pose is special, not even one turned by half a turn.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
 
 
 class Key(NamedTuple):
-    """One number: whose it is (a "camera", "station", "placement", "structure" or "dimension" by name), what, and in
-    which unit.
+    """The name of one number: the kind ("camera", "station", "placement", "structure" or "dimension") and name of its
+    owner, its quantity and its unit.
 
-    A camera, a station and a placement may carry the same name. Of a structure number the owner is the target, the
-    quantity the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x"), or a dimension of the target.
+    A camera, a station and a placement may have the same name. The owner of a structure number is the target, and its
+    quantity is the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x") or a dimension of the target.
     """
 
     kind: str
@@ -44,7 +44,7 @@ class Key(NamedTuple):
 
     @classmethod
     def of_structure(cls, name: str, kind: str = "structure") -> Key:
-        """Of a structure number by its full name, "target/feature"."""
+        """The key of a structure number by its full name, "target/feature"."""
         target, _, feature = name.partition("/")
         return cls(kind, target, feature, "m")
 
@@ -65,7 +65,7 @@ class Key(NamedTuple):
 
 
 def sigma_limits(keys: Sequence[Key]) -> Array:
-    """(P,) sigmas beyond which a number means nothing: turns of many turns, a camera in orbit."""
+    """(P,) sigmas above which a number counts as unknown: turns of many turns, a camera in orbit."""
     return np.array([_LIMITS.get(key.unit, 1e12) for key in keys])
 
 
@@ -75,9 +75,9 @@ def pose_keys(kind: str, name: str) -> list[Key]:
 
 
 def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:
-    """(..., W) values (..., K) of the keys (K), in the order of the wanted keys (W): 0 of what is not among the keys.
+    """(..., W) values (..., K) of the keys (K), rearranged for the wanted keys (W), with 0 for keys that have no value.
 
-    What is known of one camera says nothing of another: whoever takes a part of the keys takes it by this.
+    What is known of one camera says nothing of another, so all parts of a set of keys are selected by this function.
     """
     column = {key: number for number, key in enumerate(keys)}
     whole = np.zeros((*np.shape(values)[:-1], len(wanted)))
@@ -87,7 +87,7 @@ def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:
 
 
 def columns_by_owner(keys: Sequence[Key]) -> dict[Owner, list[int]]:
-    """Where the keys of each owner are."""
+    """The columns of the keys of each owner."""
     columns: dict[Owner, list[int]] = {}
     for column, key in enumerate(keys):
         columns.setdefault(STRUCTURE if key.is_structure else (key.kind, key.owner), []).append(column)
@@ -98,7 +98,7 @@ class Information(Frozen):
     """An information matrix, symmetric, not necessarily of full rank.
 
     Attributes:
-        keys: (K) the numbers. matrix: (K, K), in the inverse units of the keys.
+        keys: (K) the numbers. matrix: (K, K), in inverse units of the keys.
     """
 
     keys: tuple[Key, ...]
@@ -106,12 +106,12 @@ class Information(Frozen):
 
     @classmethod
     def nothing(cls, keys: Sequence[Key] = ()) -> Information:
-        """Nothing at all is known of these numbers."""
+        """No information on these numbers."""
         return cls(tuple(keys), np.zeros((len(keys), len(keys))))
 
     @classmethod
     def of_sigmas(cls, sigmas: Mapping[Key, float]) -> Information:
-        """Each number known by itself, to a standard deviation."""
+        """Information on independent numbers, each with a standard deviation."""
         return cls(tuple(sigmas), np.diag(np.array(list(sigmas.values()), dtype=float) ** -2.0))
 
     @cached_property
@@ -119,23 +119,23 @@ class Information(Frozen):
         return {key: column for column, key in enumerate(self.keys)}
 
     def columns(self, keys: Sequence[Key]) -> Indices:
-        """Where some of the keys are."""
+        """The columns of some of its keys."""
         return np.array([self._column[key] for key in keys], dtype=np.int64)
 
     def among(self, keys: Collection[Key]) -> tuple[Key, ...]:
-        """Those of its keys that are among others."""
+        """Those of its keys that are among the given ones, in its order."""
         wanted = set(keys)
         return tuple([key for key in self.keys if key in wanted])
 
     def given(self, keys: Sequence[Key]) -> Information:
-        """About some of the numbers, with all others held where they are."""
+        """The information on some of the numbers, with all others held."""
         if tuple(keys) == self.keys:
             return self
         at = self.columns(keys)
         return Information(tuple(keys), self.matrix[at[:, None], at])
 
     def marginal(self, keys: Sequence[Key]) -> Information:
-        """About some of the numbers, all others integrated out: the Schur complement."""
+        """The information on some of the numbers, with all others integrated out: the Schur complement."""
         wanted = set(keys)
         rest = [key for key in self.keys if key not in wanted]
         if not rest:
@@ -147,21 +147,22 @@ class Information(Frozen):
         )
 
     def without(self, keys: Collection[Key]) -> Information:
-        """About all but some numbers, of which nothing is known any more."""
+        """The information without some numbers, which are integrated out."""
         gone = set(keys)
         return self.marginal([key for key in self.keys if key not in gone])
 
     def over(self, keys: Sequence[Key]) -> Information:
-        """The same over other keys, which have all of its own among them."""
+        """The same information over other keys, which must include all of its own."""
         whole = Information.nothing(keys)
         at = whole.columns(self.keys)
         whole.matrix[at[:, None], at] = self.matrix
         return whole
 
     def widened(self, shifts: Array) -> Information:
-        """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury).
+        """The information if the covariance is larger by d d^T for each of the shifts d (S, K) (Woodbury).
 
-        By a root A of the matrix, so that rounding makes no variance negative: A^T (1 + A D D^T A^T)^-1 A.
+        It is computed by a root A of the matrix, so that rounding makes no variance negative: A^T (1 + A D D^T A^T)^-1
+        A.
         """
         if not len(shifts):
             return self
@@ -172,8 +173,8 @@ class Information(Frozen):
         return Information(self.keys, left.T @ left)
 
     def beyond(self, covariance: Array, least: float | None = None) -> tuple[float, Array]:
-        """By which factor at least a covariance (K, K) is this one's, or the one that is given; and the shifts (S, K)
-        whose products with themselves are what it is more. Directions of which nothing is known count as wide enough.
+        """The least ratio of a covariance (K, K) to the one of this information, or `least` if given; and shifts (S, K)
+        whose outer products sum to what it is beyond that ratio. Unknown directions count as wide enough.
         """
         ratios, turned = np.linalg.eigh(self.root @ covariance @ self.root.T)
         factor = least if least is not None else float(max(np.min(ratios, initial=1.0), np.finfo(float).eps))
@@ -181,10 +182,10 @@ class Information(Frozen):
         return factor, (self.spread.covariance @ self.root.T @ more).T
 
     def beside(self, stated: Information, shifts: Array) -> Array:
-        """(S, K) shifts that widen all of it as shifts (S, K) widen what is known beyond what was stated.
+        """(S, K) shifts that widen all of this as the given shifts (S, K) widen the part beyond what was stated.
 
-        With L what is known beyond, P what was stated, C = (L + P)^-1 and E the shifts, the covariance of L + P with L
-        widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
+        With L the information beyond P, what was stated, C = (L + P)^-1 and E the given shifts, the covariance of L + P
+        with L widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G replaces E.
         """
         moved = shifts @ self.less(stated).matrix @ self.inverse
         left = moved @ stated.matrix @ shifts.T
@@ -192,18 +193,18 @@ class Information(Frozen):
         return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved)
 
     def less(self, other: Information) -> Information:
-        """What is left without a part of it; nothing of numbers of which that part says all but rounding."""
-        told_from_rounding = 1e-12  # share of what is known of a number
+        """The information without a part of it; none on numbers of which only rounding would remain."""
+        told_from_rounding = 1e-12  # share of the information on a number
         left = self.matrix - other.over(self.keys).matrix
         visible = np.diagonal(left) > told_from_rounding * np.diagonal(self.matrix)
         return Information(self.keys, np.where(visible[:, None] & visible, left, 0.0))
 
     def __add__(self, other: Information) -> Information:
-        """Both together, over the keys of either."""
+        """The sum of both, over the keys of either."""
         return self.beside_all([other])
 
     def beside_all(self, others: Iterable[Information]) -> Information:
-        """All of them together, over the keys of any."""
+        """The sum of all, over the keys of any of them."""
         every = [self, *others]
         whole = Information.nothing(tuple(dict.fromkeys(chain(*(other.keys for other in every)))))
         for other in every:
@@ -218,7 +219,7 @@ class Information(Frozen):
 
     @cached_property
     def inverse(self) -> Array:
-        """(K, K) inverse over what is known; unknown directions are left out."""
+        """(K, K) inverse over known directions; unknown directions are left out."""
         return known_inverses(self.matrix, sigma_limits(self.keys))
 
     @property
@@ -228,8 +229,8 @@ class Information(Frozen):
 
     @cached_property
     def root(self) -> Array:
-        """(R, K) with root^T root = matrix: a row for each direction that is determined, in standard deviations."""
-        determined = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
+        """(R, K) with root^T root = matrix: a row for each determined direction, in standard deviations."""
+        determined = 1e-11  # eigenvalue at unit diagonal above which a direction counts as determined
         diagonal = np.diagonal(self.matrix)
         if np.count_nonzero(self.matrix) == np.count_nonzero(diagonal):
             return np.asarray(np.diag(np.sqrt(diagonal))[diagonal > 0.0])

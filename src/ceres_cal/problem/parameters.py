@@ -1,7 +1,7 @@
-"""Which numbers are free, fixed, shared or under a prior: the one owner of the solver's layout.
+"""Define which numbers are free, fixed, shared or under a prior: the only module that knows the solver's layout.
 
-The solver sees one block per camera with its free intrinsics (in the order of `intrinsic_names`, coefficients scaled to
-be of order one) and one 6-vector (rotation vector, translation) per free station and per placement.
+The solver has one block per camera with its free intrinsics (in the order of `intrinsic_names`, with coefficients
+scaled to be of order one) and one 6-vector (rotation vector, translation) per free station and per placement.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ceres_cal.scene import Camera, Target
 from ceres_cal.scene.lens import Lens, lens_class, make_lens
 
 AUTO = "auto"
-"""The lens that the data ask for: which it is, a calibration says in its options (`calibration.lens_choice`)."""
+"""The lens is chosen from the data (`calibration.lens_choice`); the result is in the options of the calibration."""
 PAPERS_POWERS = (2, 3)
-_OF_POWERS = "radial"  # the lens that powers stand for where none is named
+_OF_POWERS = "radial"  # the lens that is meant if only powers are given
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
-"""The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
+"""The intrinsics that every camera has, in the order of the solver's vector; skew follows after the coefficients."""
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -43,39 +43,37 @@ class Options(Frozen, eq=True):
     """What to solve for and how.
 
     Attributes:
-        lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
-            choice, as "radial" does, which powers alone stand for; () for (2, 3), of "spline" for as many as the
-            residuals ask for from there on (`calibration.solving`).
-        coefficients: names of those of the lens that are solved for, the others are 0; None: all.
-        free_principal_point: else it is held at the image centre, or where `fixed` says.
-        free_aspect: whether fy / fx is free, with nothing known of it (True), or held (False) at 1 or what `fixed`
-            says. None: free under what is usual of cameras, and held without that.
-        free_skew: whether the lean of the pixels' columns is free; else it is 0, or what `fixed` says. That of a
-            "spline" whose powers are open is free from eight views on.
-        usual_camera: whether what is usual of cameras is taken to hold of numbers that nobody states: a principal point
+        lens: one of `scene.lens.LENSES`, or "auto": chosen from the data.
+        powers: powers of the radius, for a lens that leaves the choice; without a named lens they mean "radial". ()
+            means (2, 3), or for "spline" as many as the residuals require (`calibration.solving`).
+        coefficients: names of the lens coefficients that are solved for, the others are 0; None: all.
+        free_principal_point: if False, it is held at the image centre, or where `fixed` says.
+        free_aspect: whether fy / fx is free without a prior (True), or held (False) at 1 or what `fixed` says. None:
+            free under what is usual of cameras, and held if that is not used.
+        free_skew: whether the skew of the pixel axes is free; if not, it is 0 or what `fixed` says. For a "spline"
+            without stated powers it is free from eight views on.
+        usual_camera: whether numbers that are not stated have priors by what is usual of cameras: a principal point
             near the middle of its image, square pixels, little decentring, a phi that lenses have
-            (`priors.usual_cameras`), under distributions with heavy tails that give way to observations.
-        terms: of the lens, besides those that it always has: names of its `more_terms`.
+            (`priors.usual_cameras`). They have heavy tails and give way to observations.
+        terms: terms of the lens beyond those that it always has: names of its `more_terms`.
         fixed: numbers held, by name: phi, aspect, cx, cy (px), skew and the lens's coefficients in the units of the
-            files.
-            They hold for every camera.
-        priors: what is known beforehand, besides the observations' own.
+            files. They hold for every camera.
+        priors: prior knowledge, besides the observations' own.
         tolerances: target -> how far it may have been built from its drawing.
-        dimensions: lengths of targets that are solved for, "target/dimension" such as "field/field_length_m": from what
-            a prior says of them, or from the target as drawn. Those that a prior is about are among them.
-        as_built: of a target without a tolerance "estimate" how far it was built from its drawing, where residuals
-            repeat over the views (what it is, a calibration says in its tolerances), or take it "as drawn".
+        dimensions: lengths of targets that are solved for, "target/dimension" such as "field/field_length_m": from a
+            prior on them, or from the target as drawn. Those with a prior are included.
+        as_built: for targets without a tolerance, "estimate" how far they were built from their drawings, where
+            residuals repeat over the views (the result is in the calibration's tolerances), or take them "as drawn".
         loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
-            deviations; from half to double of 2.5 the squared error changes by under a tenth.
-        reject_sigma: observations farther off than this many standard deviations are taken out and listed. At half of 5
-            good ones go, and the squared error of boards grows by a quarter; at double of it, with 20 % outliers over a
-            field, by three quarters.
+            deviations; halving or doubling 2.5 changes the squared error by less than a tenth.
+        reject_sigma: observations farther off than this many standard deviations are rejected and listed. At half of 5
+            good ones are rejected, and the squared error of boards grows by a quarter; at twice 5, with 20 % outliers
+            over a field, by three quarters.
         noise_scale: "estimate" the factor on the stated sigmas of points and curves from the residuals, or "stated".
-        closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline to
-            compare with, not a calibration.
+        closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline for
+            comparison, not a calibration.
         max_iterations: of each solve. threads: of the solver; 0 chooses.
-        lens_by_camera: camera -> its lens, where that is another one than `lens`, as it may be where each was chosen by
-            itself.
+        lens_by_camera: camera -> its lens, where that differs from `lens`, for example if chosen for each camera.
     """
 
     lens: str = AUTO
@@ -101,10 +99,9 @@ class Options(Frozen, eq=True):
     lens_by_camera: Mapping[str, OneLens] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out
-        # none.
+        # Range of standard deviations that make sense: a bound below rejects everything, one above rejects nothing.
         sigmas = (1e-3, 1e9)
-        largest = 2**31 - 1  # whole number that Ceres counts with
+        largest = 2**31 - 1  # largest whole number of Ceres
         take_types(self)
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
@@ -122,7 +119,7 @@ class Options(Frozen, eq=True):
             raise InputError(f"as_built must be 'estimate' or 'as drawn', not {self.as_built!r}")
         stated = (prior.dimension for prior in self.priors if prior.dimension)
         object.__setattr__(self, "dimensions", tuple(dict.fromkeys((*self.dimensions, *stated))))
-        names = self.intrinsic_names  # which refuses unknown terms, too
+        names = self.intrinsic_names  # this also refuses unknown terms
         if unknown := [name for name in self.coefficients or () if name not in names[len(OF_PIXELS) : -1]]:
             raise InputError(f"cannot solve for {unknown[0]!r}: {self._which} has {', '.join(names)}")
         for name, value in self.fixed.items():
@@ -130,7 +127,7 @@ class Options(Frozen, eq=True):
                 raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
-        if self.reject_sigma == np.inf:  # as far as anything counts, which files can hold
+        if self.reject_sigma == np.inf:  # the largest value that counts, which files can store
             object.__setattr__(self, "reject_sigma", sigmas[1])
         for name in ("loss_scale", "reject_sigma"):
             if not sigmas[0] <= getattr(self, name) <= sigmas[1]:
@@ -143,7 +140,7 @@ class Options(Frozen, eq=True):
         for name in ("max_iterations", "threads"):
             if getattr(self, name) > largest:
                 raise InputError(f"{name} must be {largest} at most, not {getattr(self, name):.3g}")
-        _ = self._own  # which refuses a lens that is none
+        _ = self._own  # this refuses lenses that do not exist
 
     @property
     def _which(self) -> str:
@@ -154,7 +151,7 @@ class Options(Frozen, eq=True):
         return self._own.get(name, self)
 
     def with_lenses(self, each: Mapping[str, Options]) -> Options:
-        """These options with the lens of each camera as others have it."""
+        """These options with the lens of each camera from the given options."""
         parts = ("lens", "powers", "coefficients", "terms", "free_skew")
         named = {name: OneLens(*(getattr(one, part) for part in parts)) for name, one in each.items()}
         first = next(iter(named.values()))
@@ -166,12 +163,12 @@ class Options(Frozen, eq=True):
         return any(one.blank_lens.roughness for one in (self, *self._own.values()))
 
     def structure_of(self, targets: Mapping[str, Target]) -> Structure:
-        """What may be built otherwise than it is drawn of the targets, all of it as drawn."""
+        """The structure of the targets that may differ from the drawing, with values as drawn."""
         return make_structure(targets, self.tolerances, self.dimensions)
 
     @cached_property
     def held(self) -> Mapping[str, float]:
-        """What `fixed` holds, and at 0 the coefficients that are not solved for."""
+        """The numbers that `fixed` holds, and coefficients that are not solved for, which are 0."""
         if self.coefficients is None:
             return self.fixed
         names = self._unset.names
@@ -179,7 +176,7 @@ class Options(Frozen, eq=True):
 
     @cached_property
     def intrinsic_names(self) -> tuple[str, ...]:
-        """What the camera can be told of beforehand: of a lens that is still to be chosen no coefficients."""
+        """Names of a camera's numbers that may be stated; without coefficients if the lens is still to be chosen."""
         return (*OF_PIXELS, "skew") if self.lens == AUTO else intrinsic_names(self.blank_lens)
 
     @cached_property
@@ -189,17 +186,17 @@ class Options(Frozen, eq=True):
         return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names]) if self.fixed else lens
 
     def with_first_power(self, views: int) -> Options:
-        """These options with a skew, which displaces by the first power, of a lens whose powers are left open, where so
-        many views tell it.
+        """These options with a free skew, which displaces by the first power of the radius, if the lens's powers are
+        left open and there are enough views.
         """
-        enough_views = 8  # that tell a skew beside a lens without a formula: no test decides there
+        enough_views = 8  # these determine a skew beside a lens without a formula: no test decides it
         if self.powers or views < enough_views or not self.usual_camera:
             return self
         return replace(self, free_skew="skew" not in self.fixed)
 
     @cached_property
     def _own(self) -> dict[str, Options]:
-        """Camera -> these options with its lens, where that is another one."""
+        """Camera -> these options with its own lens, where that differs."""
         return {name: replace(self, **vars(one), lens_by_camera={}) for name, one in self.lens_by_camera.items()}
 
     @property
@@ -219,30 +216,30 @@ def unit_px(camera: Camera) -> float:
 
 
 def intrinsics_vector(camera: Camera) -> Array:
-    """The solver's numbers of a camera, (4 + coefficients + 1,)."""
+    """(4 + coefficients + 1,) the solver's numbers of a camera."""
     scaled = np.asarray(camera.lens.values) * camera.lens.scales(unit_px(camera))
     return np.array([camera.phi, camera.aspect, *camera.principal_point, *scaled, camera.skew])
 
 
 def intrinsics_scales(camera: Camera) -> Array:
-    """What a camera's numbers in the files' units are multiplied with to become the solver's."""
+    """Factors from a camera's numbers in the files' units to the solver's."""
     return np.concatenate([np.ones(4), camera.lens.scales(unit_px(camera)), np.ones(1)])
 
 
 def with_intrinsics(camera: Camera, vector: Array) -> Camera:
-    """The camera with the solver's numbers put in."""
+    """The camera with its intrinsics taken from the solver's vector."""
     phi, aspect, cx, cy = (float(v) for v in vector[:4])
     lens = camera.lens.with_values(vector[4:-1] / camera.lens.scales(unit_px(camera)))
     return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens, skew=float(vector[-1]))
 
 
 def as_held(estimate: Estimate, options: Options) -> Estimate:
-    """The estimate with the numbers of its cameras put in that the options hold."""
+    """The estimate with the camera numbers that the options hold at their held values."""
     return replace(estimate, cameras={name: _as_held(camera, options) for name, camera in estimate.cameras.items()})
 
 
 def _as_held(camera: Camera, options: Options) -> Camera:
-    """The camera with the numbers put in that the options hold."""
+    """The camera with the numbers that the options hold at their held values."""
     middle = 0.5 * (np.array(camera.image_size) - 1.0)
     held = {} if options.free_principal_point else dict(zip(("cx", "cy"), middle.tolist(), strict=True))
     held |= options.fixed
@@ -260,7 +257,7 @@ class Station(Frozen, eq=True):
 
 
 class Estimate(Frozen, eq=True):
-    """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
+    """A value for everything that is solved for: cameras (without a pose), stations and placements, by name."""
 
     cameras: Mapping[str, Camera]
     stations: Mapping[str, Station]
@@ -272,18 +269,20 @@ class Estimate(Frozen, eq=True):
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
+        object.__setattr__(self, "placements", Poses.of(self.placements))  # costs nothing when repeated
 
     @property
     def has_floor(self) -> bool:
-        """Whether the world is a field: of boards alone a camera is the world, and in its plane z = 0 lies nothing."""
+        """Whether the world is a field. With boards only, a camera is the world, and nothing lies in its plane
+        z = 0.
+        """
         return not any(np.array_equal(one.cam_from_world.matrix, np.eye(3, 4)) for one in self.stations.values())
 
     def station_name(self, name: str | None) -> str:
-        """The name of a station; without one, that of the only one there is.
+        """The name of a station; if `name` is None, that of the only station.
 
         Raises:
-            InputError: no such station, or no name where there are several.
+            InputError: there is no such station, or no name is given and there are several.
         """
         if name is None and len(self.stations) == 1:
             return next(iter(self.stations))
@@ -301,19 +300,19 @@ class Estimate(Frozen, eq=True):
         return self.cameras[self.stations[station].camera].at(pose)
 
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
-        """cam_from_frame of each sight as [R t], (S, 3, 4)."""
+        """(S, 3, 4) cam_from_frame of each sight as [R t]."""
         stations = self._station_stack(keys)
         return chained(stations, Poses.of(self.placements).of_names(list(map(itemgetter(2), keys))))
 
     def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
-        """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
+        """The estimate with the placement of each key where its station sees it, at cam_from_target (S, 3, 4)."""
         names = [key.placement for key in keys if key.placement is not None]
         stations = self._station_stack(keys)
         moved = chained(inverted(stations), cam_from_target)
         return replace(self, placements=Poses.of(self.placements).updated(names, moved))
 
     def _station_stack(self, keys: Sequence[SightKey]) -> Array:
-        """cam_from_world of each sight, (S, 3, 4); (3, 4) where one station has them all."""
+        """(S, 3, 4) cam_from_world of each sight; (3, 4) if all have the same station."""
         names = list(map(itemgetter(1), keys))
         poses = {name: self.stations[name].cam_from_world for name in dict.fromkeys(names)}
         if len(poses) == 1:
@@ -322,11 +321,11 @@ class Estimate(Frozen, eq=True):
 
 
 class Layout(Frozen, eq=True):
-    """Which numbers the solver may move.
+    """The numbers that the solver may move.
 
     Attributes:
         free: camera -> indices into its intrinsics vector.
-        stations, placements: names of the poses that are free.
+        stations, placements: names of the free poses.
     """
 
     free: Mapping[str, Indices]
@@ -343,12 +342,12 @@ class Layout(Frozen, eq=True):
         return replace(self, free={**self.free, camera: self.free[camera][self.free[camera] != number]})
 
     def of(self, keys: Iterable[SightKey]) -> Layout:
-        """The layout of a problem with these sights alone: no placement that they do not show is free."""
+        """The layout of a problem with only these sights. Placements that they do not show are not free."""
         return replace(self, placements=self.placements & {key.placement for key in keys})
 
 
 def make_layout(observations: Observations, options: Options) -> Layout:
-    """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
+    """The layout of a calibration: everything is free except what the options fix and what nothing determines."""
     views = observations.shown_views
     return Layout(
         {name: _free_intrinsics(options.of_camera(name)) for name in observations.cameras},
@@ -358,7 +357,7 @@ def make_layout(observations: Observations, options: Options) -> Layout:
 
 
 def _free_intrinsics(options: Options) -> Indices:
-    """Indices into the vector of a camera with the lens of these options."""
+    """Indices of the free numbers in the vector of a camera with the lens of these options."""
     names = intrinsic_names(options.blank_lens)
     held = {*options.held, *options.blank_lens.set_at_start}
     if not options.free_principal_point:
@@ -371,9 +370,9 @@ def _free_intrinsics(options: Options) -> Indices:
 
 
 def anchored_stations(observations: Observations) -> frozenset[str]:
-    """One station of each group that no view ties to the world: its camera frame serves as the world.
+    """One station of each group that no view connects with the world: its camera frame is used as the world.
 
-    Boards alone tell poses among themselves only; holding one station removes that freedom.
+    Boards alone determine only relative poses; holding one station removes this freedom.
     """
     views = observations.shown_views
     times = Counter([view.placement for view in views])
@@ -399,18 +398,18 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
     return frozenset(anchors.values())
 
 
-# ---- the numbers of a camera as Ceres moves them --------------------------------------------------------------------
+# ---- charts: the numbers of a camera as Ceres moves them ------------------------------------------------------------
 
-# A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
-# height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps.
-# In coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
+# A picture taken straight down determines only phi over height: with another phi everything looks the same from another
+# height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Gauss-Newton converges slowly along
+# this curve. With coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
 
-_PHI = 0  # of the intrinsics
+_PHI = 0  # index of phi in the intrinsics
 
 
 class Chart:
-    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
-    have made in Python.
+    """Coordinates in which Ceres moves a camera's free numbers. Ceres calls this a manifold, which pyceres does not let
+    Python define.
     """
 
     def __init__(self, camera: Camera, free: Indices) -> None:
@@ -418,30 +417,30 @@ class Chart:
         self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
 
     def moved(self, numbers: Array) -> Array:
-        """(K,) what Ceres moves, of the free numbers (K,)."""
+        """(K,) the coordinates that Ceres moves, from the free numbers (K,)."""
         return np.asarray(numbers / self._scales(numbers))
 
     def numbers(self, moved: Array) -> Array:
-        """(K,) the free numbers again."""
+        """(K,) the free numbers, from the coordinates that Ceres moves."""
         return np.asarray(moved * self._scales(moved))
 
     def chained(self, jacobian: Array, numbers: Array) -> Array:
-        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
+        """(N, K) derivatives by the coordinates that Ceres moves, from those by the free numbers (K,)."""
         chained = jacobian * self._scales(numbers)
         chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
         return np.asarray(chained)
 
     def _scales(self, numbers: Array) -> Array:
-        nothing = 1e-30  # phi may be 0 on the way: no camera, which shows nothing
+        nothing = 1e-30  # phi may be 0 during a solve: such a camera shows nothing
         return np.asarray((numbers[self._phi] / self._unit or nothing) ** self._powers)
 
 
 def chart_of(camera: Camera, free: Indices) -> Chart | None:
-    """None where the numbers are moved as they are."""
+    """The chart of a camera; None where Ceres moves the numbers as they are."""
     return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
 
 
 def charts_of(estimate: Estimate, layout: Layout) -> dict[Owner, Chart]:
-    """Of the cameras whose numbers are not moved as they are."""
+    """The charts of cameras that have one."""
     charts = {("camera", name): chart_of(camera, layout.free[name]) for name, camera in estimate.cameras.items()}
     return {owner: chart for owner, chart in charts.items() if chart is not None}

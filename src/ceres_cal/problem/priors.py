@@ -1,8 +1,8 @@
-"""What is known beforehand, all of it in one form: a normal distribution of some numbers together.
+"""Prior knowledge, all in one form: a joint normal distribution of some numbers.
 
-A tape-measured height, a tolerance of the target as built and the posterior of an earlier calibration differ in nothing
-but their keys. Where an information matrix has null directions nothing is known, and nothing is inverted: the residual
-of a prior is root (x - mean) with root^T root = information.
+A tape-measured height, a tolerance of the target as built and the posterior of an earlier calibration differ only in
+their keys. Nothing is known in null directions of an information matrix, and nothing is inverted: the residual of a
+prior is root (x - mean) with root^T root = information.
 """
 
 from __future__ import annotations
@@ -21,21 +21,24 @@ from ceres_cal.problem.structure import Structure
 from ceres_cal.scene import Camera, Lens
 
 USUAL_CENTRE = 0.015
-"""Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the
-middle of pictures that were not cropped."""
-# Standard deviations of fy / fx about 1, and of either decentring coefficient. Of the public cameras tried, fy / fx is
-# up to 0.6 % off and p1 and p2 are up to 3e-3.
+"""Standard deviation of either coordinate of the principal point about the middle of the picture, for pictures that
+were not cropped, as a share of the image's diagonal: 24 px of 1600.
+"""
+# Standard deviations of fy / fx about 1, and of either decentring coefficient. In the public cameras tried, fy / fx is
+# up to 0.6 % off, and p1 and p2 are up to 3e-3.
 USUAL_ASPECT, USUAL_DECENTRING = 5e-4, 5e-4
-# Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
-# that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
+# Scale of Cauchy's loss of usual values, in standard deviations: Student's t with 3 degrees of freedom. A picture that
+# was cropped or squeezed may be arbitrarily far from usual, at the cost of a few residuals.
 USUAL_BENDS = 2.0
 ANY_PHI = 1.1, 0.8
 """phi in half image diagonals, and the standard deviation of its logarithm: fisheyes of 0.3 and lenses of cranes and
-stands, five half diagonals, are within two of it. Without it a view from straight above, which tells phi over height
-alone, let solves run away along their valley, to cameras that are none."""
+stands, five half diagonals, are within two of it. Without this prior, solves of a view from straight above, which
+determines only phi over height, run away along their valley, to impossible cameras.
+"""
 VAGUE = 0.1
-"""Of its size, what is stated of a number counts as known to so much until all else is explained: enough to stay in the
-middle of a valley along phi that frontal views leave open."""
+"""Relative standard deviation to which stated numbers count as known until everything else is explained: enough to stay
+in the middle of a valley along phi that frontal views leave open.
+"""
 _VAGUE_QUANTITIES = (*OF_PIXELS, "principal_point", "height_m", "position_m")
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
 
@@ -44,11 +47,11 @@ class GaussianPrior(Frozen):
     """A normal distribution of some intrinsics, stations and structure numbers.
 
     Attributes:
-        information: about its K numbers. mean: (K,) in the units of the keys; of a turn from its rotation.
-        rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
-        gives_way: to observations that say otherwise: it is under a distribution with heavy tails.
-        is_usual: whether nobody stated it: it is what is usual of cameras, and gives way.
-        logs: those of its numbers whose logarithms are normal: their offsets are mean log(x / mean).
+        information: on its K numbers. mean: (K,) in the units of the keys; for a turn, from its rotation.
+        rotations: station -> rotation (3, 3) of cam_from_world from which its turns are measured.
+        gives_way: whether it yields to observations that contradict it: its distribution has heavy tails.
+        is_usual: whether it was not stated, but is what is usual of cameras; it then gives way.
+        logs: numbers whose logarithms are normal: their offsets are mean log(x / mean).
     """
 
     information: Information
@@ -60,10 +63,10 @@ class GaussianPrior(Frozen):
 
     @classmethod
     def about(cls, information: Information, estimate: Estimate) -> GaussianPrior:
-        """What is known around an estimate.
+        """A prior around an estimate.
 
         Raises:
-            ValueError: a number is of a placement, which no prior speaks of.
+            ValueError: a number is of a placement; there are no priors on placements.
         """
         if any(key.kind == "placement" for key in information.keys):
             raise ValueError("a prior speaks of cameras, stations and structure, not of placements")
@@ -77,23 +80,23 @@ class GaussianPrior(Frozen):
 
     @property
     def known(self) -> int:
-        """How many numbers use up no observation for it: of what is usual, that pixels are square."""
+        """Number of its numbers that use up no observation because of it; of usual values, only square pixels."""
         if not self.is_usual:
             return len(self.information.root)
         return sum(key.quantity == "aspect" for key in self.keys)
 
     @property
     def is_of_target(self) -> bool:
-        """Whether it says alone how far targets may be from their drawings."""
+        """Whether it is only about the offsets of targets from their drawings."""
         return all(key.kind == "structure" for key in self.keys)
 
     def is_of(self, camera: str) -> bool:
-        """Whether it speaks of one camera's intrinsics alone."""
+        """Whether it is only about one camera's intrinsics."""
         return all(key[:2] == ("camera", camera) for key in self.keys)
 
     def given(self, keys: Collection[Key], estimate: Estimate | None = None) -> GaussianPrior:
-        """What it says of those of its numbers that are among the keys, with all others held: where an estimate has
-        them, or else at their mean.
+        """The prior on those of its numbers that are among the keys, given all others: at their values in the estimate,
+        or else at their mean.
         """
         own = self.information.among(keys)
         if own == self.keys:
@@ -114,7 +117,7 @@ class GaussianPrior(Frozen):
         return self._with(self.information.without(keys)) if set(keys) & set(self.keys) else self
 
     def widened(self, factors: Array) -> GaussianPrior:
-        """With standard deviations so many times (K,) as large."""
+        """A copy with standard deviations multiplied by factors (K,)."""
         information = self.information
         matrix = information.matrix / (factors[:, None] * factors)
         return replace(self, information=replace(information, matrix=matrix))
@@ -123,7 +126,7 @@ class GaussianPrior(Frozen):
         return replace(self, information=information, mean=self.mean[self.information.columns(information.keys)])
 
     def offsets(self, estimate: Estimate) -> Array:
-        """(K,) estimate less mean, in the units of the keys."""
+        """(K,) estimate minus mean, in the units of the keys."""
         off = values_of(estimate, self.keys) - self.mean
         for name, rotation in self.rotations.items():
             turn = rotation_log(estimate.stations[name].cam_from_world.rotation @ rotation.T)
@@ -133,10 +136,10 @@ class GaussianPrior(Frozen):
         return self.bent(off)[0]
 
     def bent(self, off: Array) -> tuple[Array, Array]:
-        """(K,) offsets of numbers that are `off` the mean, and their derivatives by these; of numbers whose logarithms
-        are normal, far below 0 where they are 0 or less.
+        """(K,) offsets of numbers that differ from the mean by `off`, and their derivatives by `off`. For numbers with
+        normal logarithms, the offset is far below 0 where the number is 0 or less.
         """
-        least_ratio = 1e-6  # of a number to its mean: a step of the solver may pass 0
+        least_ratio = 1e-6  # of a number to its mean: a step of the solver may go below 0
         slope = np.ones(len(off))
         if self.logs:
             at = self._of_logs
@@ -154,12 +157,14 @@ class GaussianPrior(Frozen):
         return np.asarray(self.information.root @ self.offsets(estimate))
 
     def cost(self, estimate: Estimate) -> float:
-        """Twice what it adds to the cost: squares of its residuals, Cauchy's loss of what gives way."""
+        """Twice its share of the cost: the squares of its residuals, or Cauchy's loss of them if it gives way."""
         squares = self.residuals(estimate) ** 2
         return float(np.sum(USUAL_BENDS**2 * np.log1p(squares / USUAL_BENDS**2) if self.gives_way else squares))
 
     def weighted_at(self, estimate: Estimate) -> GaussianPrior:
-        """The normal distribution that pulls as much at an estimate: what gives way counts with Cauchy's weights."""
+        """The normal distribution with the same gradient at an estimate: a prior that gives way has Cauchy's
+        weights.
+        """
         if not self.gives_way:
             return self
         off = self.offsets(estimate)
@@ -169,13 +174,13 @@ class GaussianPrior(Frozen):
         return replace(self._times(weights * slope**2), mean=here - off / slope, logs=frozenset())
 
     def loosened(self, factor: float) -> GaussianPrior:
-        """With standard deviations so many times as large, where it gives way: beside observations that are off by as
-        much more than their noise.
+        """A copy with standard deviations multiplied by a factor, if it gives way: for use beside observations whose
+        residuals exceed their noise by that factor.
         """
         return self._times(np.full(len(self.keys), factor**-2)) if self.gives_way else self
 
     def _times(self, weights: Array) -> GaussianPrior:
-        """Of numbers that are stated one by one."""
+        """A copy with its information multiplied by weights; its numbers are independent."""
         return replace(self, information=replace(self.information, matrix=weights[:, None] * self.information.matrix))
 
 
@@ -186,13 +191,13 @@ def gather_priors(
     carried: GaussianPrior | None = None,
     cameras: Mapping[str, Camera] | None = None,
 ) -> tuple[GaussianPrior, ...]:
-    """Everything that is known beforehand: an old posterior, the priors of observations and options, and tolerances.
+    """Collect all prior knowledge: an old posterior, the priors of observations and options, usual values, tolerances.
 
     Args:
-        cameras: where their lenses are not those of the options.
+        cameras: those whose lenses differ from the lens of the options.
 
     Raises:
-        InputError: a prior names a camera, a station or a quantity that is not there.
+        InputError: a prior names a camera, a station or a quantity that does not exist.
     """
     lenses = {name: camera.lens for name, camera in (cameras or {}).items()}
     stated = [*stated_priors(observations, options, lenses).values()]
@@ -206,19 +211,19 @@ def gather_priors(
 def stated_priors(
     observations: Observations, options: Options, lenses: Mapping[str, Lens] = MappingProxyType({})
 ) -> dict[Prior, GaussianPrior]:
-    """What observations and options state of numbers, once each; see `gather_priors`."""
+    """The priors that observations and options state on numbers, each once; see `gather_priors`."""
     stated = {}
-    for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
+    for prior in dict.fromkeys((*observations.priors, *options.priors)):  # a repeated statement counts once
         observations.require_owner(prior)
         is_effect = prior.is_coma and prior in observations.priors
-        if not (prior.is_open or prior.curve or is_effect):  # the first two are among the tolerances
+        if not (prior.is_open or prior.curve or is_effect):  # a prior on a curve is a tolerance
             stated[prior] = stated_prior(prior, lenses.get(prior.name) or options.of_camera(prior.name).blank_lens)
     return stated
 
 
 def freed(observations: Observations, options: Options) -> Options:
-    """The options with what they hold of cameras stated as closely as anything is; of coefficients, which have no size
-    to be known to a share of, to a tenth of the solver's unit.
+    """The options with camera numbers that they hold replaced by priors as close as any. Held coefficients, which have
+    no natural size for a relative sigma, get a tenth of the solver's unit.
     """
     held = {name: (value,) for name, value in options.fixed.items() if name in OF_PIXELS}
     each = list[Prior]()
@@ -238,7 +243,7 @@ def freed(observations: Observations, options: Options) -> Options:
 
 
 def _loose(lens: Lens, image_size: tuple[int, int]) -> dict[str, float]:
-    """What a coefficient that is held counts as known to, until all else is explained."""
+    """The sigmas to which held coefficients count as known until everything else is explained, by name."""
     units = 1.0 / lens.scales(0.5 * float(np.hypot(*image_size)))
     own = {name: VAGUE * unit for name, unit in zip(lens.names, units.tolist(), strict=True)}
     own |= dict.fromkeys(lens.tangential, USUAL_DECENTRING)
@@ -246,7 +251,7 @@ def _loose(lens: Lens, image_size: tuple[int, int]) -> dict[str, float]:
 
 
 def loosely(observations: Observations, options: Options) -> tuple[Observations, Options]:
-    """Both with what is stated of cameras and stations known so vaguely that nothing takes up what is wrong with it."""
+    """Both with statements on cameras and stations loosened, so that nothing else absorbs what is wrong with them."""
     every, options_too = (tuple(map(_vague, one.priors)) for one in (observations, options))
     of_views = observations if every == observations.priors else replace(observations, priors=every)
     return of_views, options if options_too == options.priors else replace(options, priors=options_too)
@@ -260,7 +265,7 @@ def _vague(prior: Prior) -> Prior:
 
 
 def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
-    """A prior that somebody stated, number by number.
+    """A stated prior as a normal distribution of independent numbers.
 
     Raises:
         InputError: the lens has no such number.
@@ -281,8 +286,8 @@ def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
 def usual_cameras(
     observations: Observations, options: Options, stated: Collection[Key], lenses: Mapping[str, Lens]
 ) -> Iterator[GaussianPrior]:
-    """What is usual of cameras, but for what somebody stated or set free: a principal point near the middle of its
-    image, square pixels, a lens that is little decentred, a phi of lenses that people have.
+    """Priors by what is usual of cameras, except on numbers that are stated or set free: a principal point near the
+    middle of the image, square pixels, little decentring, and a phi that common lenses have.
     """
     for name, size in observations.cameras.items():
         lens = lenses.get(name) or options.of_camera(name).blank_lens
@@ -304,7 +309,7 @@ def usual_cameras(
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:
-    """How far the targets may have been built from their drawings; not of numbers that are known already."""
+    """The prior on how far targets may be off their drawings, without numbers that are known already."""
     stated = dict(zip(structure.keys[: structure.own], structure.sigma_m.tolist(), strict=False))
     sigmas = {key: sigma for key, sigma in stated.items() if key not in set(known)}
     if sigmas:

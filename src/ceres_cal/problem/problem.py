@@ -1,4 +1,4 @@
-"""The one least-squares problem: everything about it but the place where it stands."""
+"""The one least-squares problem: everything about it except the estimate at which it is evaluated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Weighting(Frozen, eq=True):
 
     Attributes:
         point_scale, curve_scale: noise scales, factors on the stated sigmas.
-        loss, loss_scale: robust loss of each observation, its scale in standard deviations.
+        loss, loss_scale: robust loss of each observation, and its scale in standard deviations.
     """
 
     point_scale: float = 1.0
@@ -40,35 +40,35 @@ class Weighting(Frozen, eq=True):
 
     @property
     def is_convex(self) -> bool:
-        """Whether the loss has one minimum."""
+        """Whether the loss has only one minimum."""
         return self.loss in _CONVEX
 
 
 class RemoteObservations(Protocol):
-    """Observations of the world that are not at hand: they answer with sums."""
+    """Observations of the world that are not in memory here: they answer with sums."""
 
     @property
     def equations(self) -> int:
-        """How many measured numbers they are."""
+        """The number of measured numbers."""
 
     def cost(self, run: Any, problem: Problem, estimate: Estimate) -> Any:
-        """What Ceres sees of them: its `owners` say by kind and name which numbers it depends on."""
+        """Their cost function for Ceres. Its `owners` name, by kind and name, the numbers that it depends on."""
 
     def normals(self, problem: Problem, estimate: Estimate) -> Mapping[tuple[SightKey, int], Array]:
         """Their normal equations by sight and kind, see `problem.reduced`."""
 
 
 class Problem(Frozen):
-    """What is minimised, over what, under what was known before.
+    """A least-squares problem: observations, free numbers and prior knowledge.
 
     Attributes:
         sights: the observations that take part. layout: the numbers that are free.
-        priors: all that is known beforehand; of numbers that are held they say nothing.
-        elsewhere: more observations of the world, which are not at hand.
-        smoothness: camera -> standard deviations (px) of its lens's `roughness`; its loose ones where it is not named.
+        priors: all prior knowledge; what it says of held numbers does not count.
+        elsewhere: further observations of the world, which are not in memory here.
+        smoothness: camera -> standard deviations (px) of its lens's `roughness`; the loose ones if it is not named.
         weighting: of the observations. options: iterations and threads.
-        taken_up: equations that effects use up which were taken off the observations.
-        feet: (M,) where on its track each curve observation's foot is sought first (see `residuals`), by row.
+        taken_up: degrees of freedom that effects used which were subtracted from the observations.
+        feet: (M,) initial foot of each curve observation on its track (see `residuals`), by row.
     """
 
     sights: Sights
@@ -83,33 +83,33 @@ class Problem(Frozen):
 
     @property
     def observations(self) -> Observations:
-        """All of them, also those that take no part."""
+        """All observations, including those that take no part."""
         return self.sights.observations
 
     @cached_property
     def private(self) -> frozenset[str | None]:
-        """Free placements that a single sight shows: each can be eliminated by itself."""
+        """Free placements that only one sight shows: each can be eliminated by itself."""
         return self.layout.placements & self.sights.seen_once
 
     def priors_of(self, estimate: Estimate) -> list[GaussianPrior]:
-        """The priors and the smoothness of lenses, of numbers that are free."""
+        """The priors and the smoothness of lenses, restricted to free numbers."""
         smooth = (self.smooth_at(estimate, name) for name in estimate.cameras)
         return [*self.stated_at(estimate), *chain.from_iterable(smooth)]
 
     def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
-        """What these say at an estimate: what is usual counts less, the farther off it is."""
+        """The same as normal distributions at an estimate: usual values count less, the farther off they are."""
         return [prior.weighted_at(estimate) for prior in self.priors_of(estimate)]
 
     def stated_at(self, estimate: Estimate) -> list[GaussianPrior]:
-        """What the priors say of numbers that are free, with those that are held where the estimate has them."""
+        """The priors on free numbers, given held numbers at their values in the estimate."""
         if not self.priors:
             return []
-        free = set(free_keys(estimate, self.layout, self.layout.placements))  # of placements nothing is known before
+        free = set(free_keys(estimate, self.layout, self.layout.placements))  # no prior is on placements
         restricted = [prior.given(free, estimate) for prior in self.priors]
         return [prior for prior in restricted if prior.keys]
 
     def smooth_at(self, estimate: Estimate, camera: str) -> Iterator[GaussianPrior]:
-        """What its smoothness says of a camera's lens, of mean nought, where no posterior says so already."""
+        """The smoothness of a camera's lens as priors of mean 0, unless a posterior includes it already."""
         lens, numbers = estimate.cameras[camera].lens, self.layout.free[camera]
         if not (len(numbers) and (forms := lens.roughness)) or self.knows_lens(camera, lens):
             return
@@ -122,7 +122,7 @@ class Problem(Frozen):
                 yield GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own))).given(free)
 
     def knows_lens(self, camera: str, lens: Lens) -> bool:
-        """Whether a posterior states all that is free of a camera's lens: how smooth it is, is in there."""
+        """Whether a posterior states all free roughness coefficients of a camera's lens, and so its smoothness."""
         every = intrinsic_names(lens)
         free = {every[number] for number in self.layout.free[camera].tolist()}
         rough = free.intersection(name for form in lens.roughness for name in form.names)
@@ -130,7 +130,7 @@ class Problem(Frozen):
 
     @cached_property
     def _stated_whole(self) -> dict[str, frozenset[str]]:
-        """Camera -> the coefficients of its lens, where a prior states these in every direction."""
+        """Camera -> the coefficients of its lens, where a prior states them in every direction."""
         stated: dict[str, frozenset[str]] = {}
         for prior in self.priors:
             for name in {key.owner for key in prior.keys if key.kind == "camera" and not prior.is_usual}:
@@ -142,48 +142,48 @@ class Problem(Frozen):
 
     @property
     def equations(self) -> int:
-        """Measured numbers: two of each point, one of each curve observation."""
+        """The number of measured numbers: two for each point, one for each curve observation."""
         return self.sights.equations + (self.elsewhere.equations if self.elsewhere else 0)
 
     def unknowns(self, estimate: Estimate) -> int:
-        """Number of free numbers that use up observations: what is known beforehand does not."""
+        """Number of free numbers that use up observations; numbers with a prior do not."""
         known = sum(prior.known for prior in self.priors_of(estimate))
         return max(self.layout.size + len(estimate.structure.values) - known, 0)
 
     def weighted(self, weighting: Weighting) -> Problem:
-        """The same with other weights."""
+        """A copy with another weighting."""
         return replace(self, weighting=weighting)
 
     def rough(self, weighting: Weighting) -> Problem:
-        """The same with the weights of residuals that are more than noise, and what is usual known as much less."""
+        """A copy with a weighting for residuals larger than noise, in which usual values count as much less."""
         loose = tuple(prior.loosened(max(1.0, *weighting.scales)) for prior in self.priors)
         return replace(self, priors=loose, weighting=weighting)
 
     def used(self, points: Mask, curves: Mask) -> Problem:
-        """The problem of these rows of the observations alone."""
+        """The problem of the observations in these rows only."""
         return replace(self, sights=self.sights.used(points, curves))
 
     def of_rows(self, points: Indices, curves: Indices) -> Problem:
-        """The problem of some of the observations, in their order, as if there were no others."""
+        """The problem of some of the observations, in the given order, as if there were no others."""
         sights = self.sights.renumbered(points, curves)
         return replace(self, sights=sights, layout=self.layout.of(sights.keys))
 
     def of_sights(self, numbers: Indices) -> Problem:
-        """The problem of some of the sights: no placement that they do not show is free."""
+        """The problem of some of the sights. Placements that they do not show are not free."""
         sights = self.sights.take(numbers)
         return replace(self, sights=sights, layout=self.layout.of(sights.keys))
 
     def holding(self, camera: str, number: int) -> Problem:
-        """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
+        """The problem with one of a camera's intrinsics held; `number`: its index in the solver's vector."""
         return replace(self, layout=self.layout.holding(camera, number))
 
     def built_as(self, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """The problem and the estimate of targets that are drawn as the estimate has them built."""
+        """The problem and the estimate of targets drawn as the estimate has them built."""
         sights = estimate.structure.built_into(self.sights)
         return replace(self, sights=sights), replace(estimate, structure=EXACT)
 
 
 def problem_of(sights: Sights, options: Options, estimate: Estimate) -> Problem:
-    """What is minimised, before anything was weighed."""
+    """The problem of some sights, before any weighting."""
     priors = gather_priors(sights.observations, options, estimate.structure)
     return Problem(sights, make_layout(sights.observations, options), priors, options=options)

@@ -1,6 +1,6 @@
-"""The numbers behind the keys: their values in an estimate, natural sizes, steps along them, and what they can be.
+"""The numbers behind the keys: their values in an estimate, natural sizes, steps along them, and possible ranges.
 
-How what a camera shows moves with its numbers: exactly, by the loops of the solve.
+Also how the pixels that a camera shows move with its numbers: exactly, by the kernels of the solve.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class PixelSlopes(NamedTuple):
 
 
 def pixel_slopes(camera: Camera, places: Array) -> PixelSlopes:
-    """Of a camera at its pose, of places (N, 3) m; NaN among these are shown nowhere."""
+    """The derivatives for a camera at its pose, for places (N, 3) m; NaN for places that are NaN."""
     optics, scales = camera_optics(camera), intrinsics_scales(camera)
     known = np.flatnonzero(np.isfinite(places).all(axis=1))
     count, size = len(known), len(scales)
@@ -63,16 +63,16 @@ def pixel_slopes(camera: Camera, places: Array) -> PixelSlopes:
     kernels.point_rows(optics, camera.cam_from_world.matrix[None], points, shown)
     rows[known] = shown
     intrinsics, turns, shifts, _ = np.split(rows, [size, size + 3, size + 6], axis=2)
-    pose = camera.cam_from_world  # whose translation turns along about the camera
+    pose = camera.cam_from_world  # a turn about the camera also turns its translation
     return PixelSlopes(intrinsics * scales, turns + shifts @ skew(pose.translation).T, shifts @ pose.rotation)
 
 
 def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """(P,) what each number is compared with: an error of a hundredth of it moves a picture by about a hundredth.
+    """(P,) natural size of each number: an error of a hundredth of it moves a picture by about a hundredth.
 
-    phi and the principal point go with phi, positions with the distance to what is seen, turns with 1 rad, coefficients
-    with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance,
-    dimensions with themselves.
+    It is phi for phi and the principal point, the distance to what is seen for positions, 1 rad for turns, the value
+    that moves a pixel half an image diagonal from the middle by as much for coefficients, the tolerance for structure,
+    and the dimension itself for dimensions.
     """
     sizes = np.ones(len(keys))
     for (kind, owner), columns in columns_by_owner(keys).items():
@@ -91,8 +91,8 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 
 def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
-    """From a station to the floor, or to the nearest placement where that is farther; from a placement to the nearest
-    station. Of a rig that sees no field the floor is nothing: heights are those above another camera.
+    """Distance (m) of a station from the floor, or from the nearest placement if that is larger; or of a placement from
+    the nearest station. For a rig that sees no field, the floor means nothing: heights are relative to another camera.
     """
     if kind == "station":
         here, others = estimate.stations[owner].cam_from_world.position, list(estimate.placements.values())
@@ -104,7 +104,7 @@ def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
 
 
 def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """(P,) the estimate's numbers in the units of the keys; 0 for a turn."""
+    """(P,) the estimate's numbers in the units of the keys; 0 for turns."""
     values = np.zeros(len(keys))
     for (kind, owner), columns in columns_by_owner(keys).items():
         names = [keys[column].quantity for column in columns]
@@ -135,7 +135,7 @@ def _intrinsic_keys(name: str, quantities: tuple[str, ...], units: tuple[str, ..
 
 
 def every_key(estimate: Estimate) -> frozenset[Key]:
-    """Keys of everything that an estimate has, free or held."""
+    """Keys of all numbers of an estimate, free or held."""
     intrinsics = (intrinsic_keys(name, camera.lens) for name, camera in estimate.cameras.items())
     stations = (pose_keys("station", name) for name in estimate.stations)
     placements = (pose_keys("placement", name) for name in estimate.placements)
@@ -143,7 +143,7 @@ def every_key(estimate: Estimate) -> frozenset[Key]:
 
 
 def free_keys(estimate: Estimate, layout: Layout, private: Set[str | None] = frozenset()) -> tuple[Key, ...]:
-    """Keys of everything free but the private placements: cameras, stations, placements, structure."""
+    """Keys of everything free except private placements: cameras, stations, placements, structure."""
     keys: list[Key] = []
     for name, camera in estimate.cameras.items():
         every = intrinsic_keys(name, camera.lens)
@@ -176,7 +176,7 @@ def from_placement(cam_from_target: Array, cam_from_world: Pose) -> Array:
 
 
 def layout_of(keys: Sequence[Key], estimate: Estimate, placements: Iterable[str] = ()) -> Layout:
-    """The layout of the problem whose shared numbers are the keys, and of placements besides."""
+    """The layout of a problem whose shared numbers are the keys; `placements` are free besides."""
     free = {}
     for name, camera in estimate.cameras.items():
         place = {quantity: number for number, quantity in enumerate(intrinsic_names(camera.lens))}
@@ -253,31 +253,31 @@ def difference(estimate: Estimate, reference: Estimate, keys: Sequence[Key]) -> 
 # ---- what a stated number can be ------------------------------------------------------------------------------------
 
 
-# The range of each kind of number, asked once of all that is stated before a solve. A range is wide: what lies beyond
-# is impossible, not unusual. Whatever lies within is judged by the observations (`robust/conflicts.py`).
+# The range of each kind of number, checked once for all that is stated before a solve. A range is wide: values beyond
+# it are impossible, not unusual. Values within it are judged by the observations (`robust/conflicts.py`).
 
 PHI_RANGE = (0.15, 15.0)
-"""In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
+"""Range of phi in half image diagonals: 163 to 8 degrees across the image's diagonal, all lenses used over fields."""
 
 
 def is_lens(camera: Camera) -> bool:
-    """Whether its phi is one that a lens over a field has."""
+    """Whether its phi is possible for a lens over a field."""
     return PHI_RANGE[0] <= camera.phi / unit_px(camera) <= PHI_RANGE[1]
 
 
-_REDRAWN = 20.0  # times a dimension as drawn, or the inverse: beyond it another target was drawn
-# Of the longest side of the target's bounding box. Paper that is held by hand bends by a fiftieth.
+_REDRAWN = 20.0  # largest ratio of a dimension to the drawing, or its inverse: beyond it another target was drawn
+# Largest tolerance, relative to the longest side of the target's box. Paper held by hand bends by a fiftieth.
 _BUILT = 0.05
 FINEST = 1e-6
-"""m and px: a standard deviation below a micrometre, or a millionth of a pixel, was measured by nobody. A hundredth of
-it is solved for without loss; at a ten-thousandth the solve no longer converges."""
+"""Least standard deviation, m and px: nobody measures to a millionth of either. A hundredth of it is solved for without
+loss; at a ten-thousandth the solve no longer converges."""
 
 
 class Range(Frozen, eq=True):
-    """What a number of one kind can be.
+    """The possible values of one kind of number.
 
     Attributes:
-        least, most: in its unit. unit: "m", "px" or "". finest: the least standard deviation. why: what bounds it.
+        least, most: in its unit. unit: "m", "px" or "". finest: least standard deviation. why: reason of the limits.
     """
 
     least: float
@@ -287,11 +287,11 @@ class Range(Frozen, eq=True):
     why: str
 
     def holds(self, value: float) -> bool:
-        """Whether a number can be such a number."""
+        """Whether a value is possible."""
         return self.least <= value <= self.most
 
     def require(self, value: float, what: str) -> None:
-        """Raise InputError where a number cannot be such a number."""
+        """Raise InputError if a value is impossible; `what` names the number."""
         if self.holds(value):
             return
         bound = f"at most {self.most:.3g}" if value > self.most else f"at least {self.least:.3g}"
@@ -299,7 +299,7 @@ class Range(Frozen, eq=True):
         raise InputError(f"{what} is {value:g}{unit}, but it is {bound}{unit}: {self.why}{self._in_mm(value)}")
 
     def require_sigma(self, sigma: float, what: str) -> None:
-        """Raise InputError where a standard deviation is finer than anything measured."""
+        """Raise InputError if a standard deviation is smaller than anything measured; `what` names the number."""
         if sigma < self.finest:
             unit = f" {self.unit}" if self.unit else ""
             raise InputError(f"{what} has a sigma of {sigma:g}{unit}: give at least {self.finest:.3g}{unit}")
@@ -315,11 +315,10 @@ class Range(Frozen, eq=True):
 
 
 def require_possible_numbers(observations: Observations, options: Options) -> None:
-    """Check everything that is stated: priors of the observations and of the options, numbers that are held, and
-    tolerances.
+    """Check all that is stated: priors of the observations and of the options, numbers that are held, and tolerances.
 
     Raises:
-        InputError: a number that is impossible, or a standard deviation that nobody can have measured; naming it.
+        InputError: it names a number that is impossible, or a standard deviation that nobody can have measured.
     """
     for prior in dict.fromkeys((*observations.priors, *options.priors)):
         observations.require_owner(prior)
@@ -337,46 +336,46 @@ def require_possible_numbers(observations: Observations, options: Options) -> No
 
 
 def _ranges(prior: Prior, observations: Observations, options: Options) -> Iterator[Range]:
-    """The range of each of a prior's numbers."""
+    """The range of each number of a prior."""
     if prior.owner == "camera":
         yield from camera_ranges(prior.quantity, observations.cameras[prior.name], _named_lens(options, prior.name))
     elif prior.owner == "station":
         yield from _of_place(prior.name, observations)[-len(prior.value) :]
     elif prior.dimension:
         drawn_m = dimensions_of(observations.targets).get(prior.dimension, np.nan)
-        if np.isfinite(drawn_m):  # another error names a dimension that is not there
+        if np.isfinite(drawn_m):  # a dimension that does not exist is reported elsewhere
             yield dimension_range(drawn_m)
     elif prior.curve:
         yield Range(0.0, 0.0, "m", FINEST, "an offset is about 0")
 
 
 def _named_lens(options: Options, camera: str) -> Lens | None:
-    """A camera's lens; None of one that is still to be chosen."""
+    """A camera's lens; None if it is still to be chosen."""
     return None if options.lens == "auto" else options.of_camera(camera).blank_lens
 
 
 def camera_ranges(quantity: str, image_size: tuple[int, int], lens: Lens | None) -> Iterator[Range]:
-    """Of each number of a quantity that a prior on a camera may name."""
+    """The range of each number of a quantity on which a camera prior may be."""
     names = ("cx", "cy") if quantity == "principal_point" else (quantity,)
     yield from (_of_camera(name, image_size, lens) for name in names)
 
 
 def dimension_range(drawn_m: float) -> Range:
-    """Of a dimension of a target, by how it is drawn."""
+    """The range of a target's dimension, relative to its drawing."""
     why = f"the target is drawn with {drawn_m:g} m"
     return Range(drawn_m / _REDRAWN, drawn_m * _REDRAWN, "m", FINEST, why)
 
 
 def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Range:
-    """Of a camera's number, by its name."""
-    finest_ratio = 1e-9  # of numbers without a unit, which are of order one
-    # In the solver's unit, in which it is of order one; the rational model's reach a few hundred.
+    """The range of a camera's number, by its name."""
+    finest_ratio = 1e-9  # least standard deviation of numbers without a unit, which are of order one
+    # In the solver's unit, in which a coefficient is of order one; those of the rational model reach a few hundred.
     coefficient = 1e6
     skew = (-1.0, 1.0)  # columns that lean by 45 degrees
     aspect = (0.1, 10.0)  # anamorphic lenses and skipped rows have 0.5 to 2
-    off_centre = 10.0  # half image diagonals: a picture that was cropped from one ten times as large
-    # In half image diagonals: from a fisheye whose image circle takes a tenth of the picture to a telescope that shows
-    # one degree. Millimetres of a lens lie below it.
+    off_centre = 10.0  # in half image diagonals: a picture that was cropped from one ten times as large
+    # In half image diagonals: from a fisheye whose image circle fills a tenth of the picture to a telescope that shows
+    # one degree. A focal length in millimetres is below it.
     phi = (0.05, 100.0)
     size = np.array(image_size, dtype=float)
     half = 0.5 * float(np.hypot(*size))
@@ -395,9 +394,9 @@ def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Ran
 
 
 def _of_place(station: str, observations: Observations) -> tuple[Range, Range, Range]:
-    """Of a station's position: from farther away no lens would show what was observed as large.
+    """The ranges of a station's position: from farther away no lens would show what was observed as large as it is.
 
-    Points at most L apart, seen from d, lie at most phi L / d apart in the image.
+    Points at most L apart, seen from d, are at most phi L / d apart in the image.
     """
     spread_px, places, floors = 0.0, [np.empty((0, 3))], [np.empty((0, 3))]
     for number, view in enumerate(observations.views):
@@ -410,14 +409,14 @@ def _of_place(station: str, observations: Observations) -> tuple[Range, Range, R
             if len(pixels):
                 spread_px = max(spread_px, float(np.hypot(*(pixels.max(axis=0) - pixels.min(axis=0)))))
     seen = np.concatenate(places)
-    if not len(seen) or spread_px == 0.0:  # boards alone, whose world is wherever one likes
+    if not len(seen) or spread_px == 0.0:  # with boards alone, the place of the world is arbitrary
         return (Range(-np.inf, np.inf, "m", FINEST, ""),) * 3
     diagonal_px = float(np.hypot(*observations.cameras[observations.stations[station]]))
     return place_ranges(seen, spread_px / diagonal_px, f"{spread_px:.0f} px", floor_of(np.concatenate(floors)))
 
 
 def floor_of(places: Array) -> float | None:
-    """Height of the lowest place, where they lie about level; None where they stand upright, or on a line."""
+    """Height (m) of the lowest place if the places are about level; None if they stand upright, or lie on a line."""
     if len(places) < 3:
         return None
     _, sizes, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
@@ -426,12 +425,13 @@ def floor_of(places: Array) -> float | None:
 
 
 def place_ranges(seen: Array, spread: float, said: str, floor_m: float | None) -> tuple[Range, Range, Range]:
-    """Of x, y and height of a station that sees places (P, 3) m over so much of its image's diagonal; `said` in words.
+    """The ranges of x, y and height of a station whose view of places (P, 3) m fills a share `spread` of its image's
+    diagonal; `said` is that extent in words.
 
     Args:
-        floor_m: height of a floor among them, which is seen from above.
+        floor_m: height of a floor among the places, which is seen from above.
     """
-    size_m = 2.0 * float(np.linalg.norm(seen.max(axis=0) - seen.min(axis=0)))  # of arcs half is among the places
+    size_m = 2.0 * float(np.linalg.norm(seen.max(axis=0) - seen.min(axis=0)))  # the places have half of an arc
     most_m = 0.5 * PHI_RANGE[1] * size_m / spread + float(np.max(np.linalg.norm(seen, axis=1)))
     place = Range(-most_m, most_m, "m", FINEST, f"no lens shows its target {said} large from farther away")
     if floor_m is None:
@@ -442,7 +442,7 @@ def place_ranges(seen: Array, spread: float, said: str, floor_m: float | None) -
 
 def _require_tolerance(tolerance: Tolerance, target: str, observations: Observations) -> None:
     sizes_m = {name: float(np.max(np.diff(one.box, axis=0))) for name, one in observations.targets.items()}
-    size_m = sizes_m[target] or max(sizes_m.values()) or np.inf  # a pole's top is placed on the field
+    size_m = sizes_m[target] or max(sizes_m.values()) or np.inf  # a pole's top has no size, and is placed on the field
     bounds = Range(0.0, _BUILT * size_m, "m", 0.0, f"the target is {two_digits(size_m, 3)} m long")
     plain: Mapping[str, float] = {name: value for name, value in vars(tolerance).items() if name != "curve_m"}
     for name, value in {**plain, **tolerance.curve_m}.items():

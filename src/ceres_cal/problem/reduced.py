@@ -1,7 +1,7 @@
-"""What observations and priors say of every number, where an estimate stands: J^T W J, nothing moved (design, 6).
+"""The information of observations and priors on every number at an estimate: J^T W J, nothing is moved (design, 6).
 
-Every sight gives its compressed normal equations once; placements that one station sees are eliminated, the rest is
-added up over what is shared, in the coordinates of `problem.information`.
+Every sight gives its compressed normal equations once. Placements that one station sees are eliminated; the rest is
+summed over the shared numbers, in the coordinates of `problem.information`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class PrivatePlacements(Frozen):
     """Private placements of one station: their own information, and how they follow the shared numbers.
 
     Attributes:
-        station: its name. names: (S). own: (S, 6, 6) information about each with everything shared held; inverses:
-            (S, 6, 6) of that, over what is known.
-        gains: (S, 6, K); a step d of the shared numbers `keys` (K) takes each placement along by -gains d.
+        station: its name. names: (S). own: (S, 6, 6) information on each with everything shared held. inverses: (S, 6,
+            6) of that, over known directions.
+        gains: (S, 6, K); a step d of the shared numbers `keys` (K) moves each placement by -gains d.
     """
 
     station: str
@@ -41,20 +41,20 @@ class PrivatePlacements(Frozen):
 
     @property
     def ranks(self) -> Array:
-        """(S,) directions of each that its own observations determine."""
+        """(S,) number of directions of each placement that its own observations determine."""
         return np.asarray(np.einsum("sij,sji->s", self.own, self.inverses))
 
 
 class ReducedInformation(Frozen):
-    """J^T W J of everything shared, private placements eliminated.
+    """J^T W J of everything shared, with private placements eliminated.
 
     Attributes:
-        points, curves: what the observations of either kind say. priors: what was known before.
-        stated: that part of the priors which somebody stated, or an earlier calibration found. built: that part of them
-            which says how far targets may be from their drawings: a scatter that equations have in common.
+        points, curves: information of the observations of either kind. priors: prior information.
+        stated: the part of the priors that was stated or comes from an earlier calibration. built: the part that says
+            how far targets may be off their drawings, a scatter that equations have in common.
         eliminated: the private placements, by station.
-        pull: (K,) by how much all priors but those of targets pull there: half the slope of their squares.
-        point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
+        pull: (K,) half the derivative of the squares of all priors, except those on targets, at the estimate.
+        point_leverage, curve_leverage: the equations of either kind that private placements absorb by themselves.
     """
 
     points: Information
@@ -69,12 +69,12 @@ class ReducedInformation(Frozen):
 
     @cached_property
     def shared(self) -> Information:
-        """All of it together."""
+        """All information together."""
         return self.points + self.curves + self.priors
 
     @property
     def leverages(self) -> tuple[float, float]:
-        """Equations of points and of curves that the free numbers take up: the traces of the hat matrix."""
+        """Equations of points and of curves that the free numbers absorb: the traces of the hat matrix."""
         covariance = self.shared.inverse
         return (
             self.point_leverage + float(np.sum(covariance * self.points.matrix)),
@@ -83,20 +83,20 @@ class ReducedInformation(Frozen):
 
 
 def information(problem: Problem, estimate: Estimate) -> ReducedInformation:
-    """What the observations and priors say of the free intrinsics, stations, placements and structure.
+    """The information of observations and priors on the free intrinsics, stations, placements and structure.
 
-    Each observation counts with its robust weight rho'. For a placement to be eliminated rightly it must be at its
-    best, as it is after a solve.
+    Each observation counts with its robust weight rho'. Eliminated placements must be at their best, as they are after
+    a solve.
 
     Raises:
-        SolutionError: an observation cannot be projected from there.
+        SolutionError: an observation cannot be projected at this estimate.
     """
     return _InformationSums(problem, estimate).result()
 
 
 def normals_of(sight: Sights, problem: Problem, estimate: Estimate) -> dict[int, Array]:
-    """Normal equations (K, K) of a single sight by kind: of points (0) and of curves (1), where there are any. K is
-    [free intrinsics in the units of the files | structure | left perturbation of the pose: turn, shift].
+    """Normal equations (K, K) of a single sight by kind, of points (0) and of curves (1), if there are any. K is [free
+    intrinsics in the units of the files | structure | left perturbation of the pose: turn, shift].
 
     Raises:
         SolutionError: an observation cannot be projected.
@@ -116,13 +116,13 @@ def normals_with_residuals(sights: Sights, problem: Problem, estimate: Estimate)
 
 
 def owned_columns(keys: Sequence[Key]) -> dict[Owner, Indices]:
-    """Where the keys of each owner are, and of the structure where it has none."""
+    """The columns of the keys of each owner, and an entry for the structure in any case."""
     columns = {STRUCTURE: list[int](), **columns_by_owner(keys)}
     return {owner: np.array(at, dtype=np.int64) for owner, at in columns.items()}
 
 
 def steps_of(key: SightKey, pose: Array, estimate: Estimate, columns: Mapping[Owner, Indices]) -> tuple[Array, Indices]:
-    """What steps of the shared numbers do to those of a sight (see `normals_of`), (K, P), and which numbers they are.
+    """Derivatives (K, P) of a sight's numbers (see `normals_of`) by P shared numbers, and the columns of these.
 
     Args:
         pose: (3, 4) cam_from_frame. columns: see `owned_columns`.
@@ -151,7 +151,7 @@ class _InformationSums:
         self._matrices, self._leverages = np.zeros((2, size, size)), np.zeros(2)  # of points, of curves
 
     def result(self) -> ReducedInformation:
-        """Everything that the problem says."""
+        """The information of the whole problem."""
         sights, private = self._problem.sights, self._problem.private
         alone = sights.numbers(placements=private)
         eliminated = []
@@ -191,14 +191,14 @@ class _InformationSums:
         }
         poses = self._estimate.pose_stack(sights.keys)
         size = len(self._problem.layout.free[sights.keys[0].camera]) + len(self._estimate.structure.values) + 6
-        most_numbers = 250_000  # of normal equations worked on at once: they stay where the processor is quick
+        most_numbers = 250_000  # entries of the normal equations in a batch: they fit into the processor's cache
         batch = max(1, most_numbers // size**2)
         for first in range(0, len(sights), batch):
             last = min(first + batch, len(sights))
             yield poses[first:last], {kind: one(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}
 
     def _eliminate(self, sights: Sights) -> PrivatePlacements:
-        """The private placements of one station; what is left of their sights is added to the sums."""
+        """Eliminate the private placements of one station; what their sights say of the rest is added to the sums."""
         key = sights.keys[0]
         world = self._estimate.stations[key.station].cam_from_world
         lead = np.concatenate([self._owned("camera", key.camera), self._columns[STRUCTURE]])
@@ -214,7 +214,7 @@ class _InformationSums:
             follows = covariance @ whole[:, -6:, :-6]
             self._add_reduced(reduced, normals, covariance, follows)
             gain = back @ follows
-            if len(station):  # the placement makes up for whatever its station does
+            if len(station):  # the placement compensates every motion of its station
                 gain = np.concatenate([gain, back @ from_station(poses, world)], axis=2)
             stacks.append((own, inverse, gain))
         for whole, own in zip(self._matrices, reduced, strict=True):
@@ -227,10 +227,11 @@ class _InformationSums:
         )
 
     def _add_reduced(self, sums: Array, normals: dict[int, Array], covariance: Array, follows: Array) -> None:
-        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, added to the sums (2, K, K).
+        """Add V^T N V of each kind, where V is how a sight's numbers follow the shared ones, to the sums (2, K, K).
 
         Args:
-            covariance: (S, 6, 6) of each pose with everything shared held. follows: (S, 6, K) less what V has for it.
+            covariance: (S, 6, 6) of each pose with everything shared held. follows: (S, 6, K) minus V's rows of the
+                pose.
         """
         rows, size = 6 * len(follows), follows.shape[2]
         flat = follows.reshape(rows, size)
@@ -238,15 +239,15 @@ class _InformationSums:
             coupling = normal[:, -6:, :-6]
             sums[kind] += np.sum(normal[:, :-6, :-6], axis=0)
             sums[kind] -= coupling.reshape(rows, size).T @ flat
-            if len(normals) > 1:  # of all kinds together the placements are at their best, not of each
+            if len(normals) > 1:  # placements are at their best for all kinds together, not for each kind
                 left = coupling - normal[:, -6:, -6:] @ follows
                 sums[kind] -= flat.T @ left.reshape(rows, size)
             self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 
     def _add(self, key: SightKey, normals: Mapping[int, Array]) -> None:
-        """What a sight that nothing is eliminated from says, added to the sums."""
+        """Add the normal equations of a sight from which nothing is eliminated to the sums."""
         steps, everywhere = steps_of(key, self._estimate.pose_stack([key])[0], self._estimate, self._columns)
-        own = len(steps) - 6  # which are shared themselves; the pose's steps follow
+        own = len(steps) - 6  # these numbers are shared themselves; the steps of the pose follow
         chain = steps[own:, own:]
         for kind, normal in normals.items():
             along = np.hstack([normal[:, :own], normal[:, own:] @ chain])
@@ -255,18 +256,18 @@ class _InformationSums:
 
 
 def _limits(own: Array) -> Array:
-    """(S, 6) sigmas beyond which a placement's number is unknown: what remains of a turn about the middle of rings, in
-    sums over all of their rows, is rounding of its other turns.
+    """(S, 6) sigmas beyond which a placement's number is unknown. Sums over all rows of rings, for the turn about their
+    centre, are only rounding of the other turns.
     """
-    rounding = 1e-13  # of a sum over a sight's rows
+    rounding = 1e-13  # share of a sum over the rows of a sight
     turns, shifts = np.max(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3), axis=2).T
     largest = np.repeat(np.column_stack([turns, shifts]), 3, axis=1)
     return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (rounding * largest + 1e-300) ** -0.5))
 
 
 def _kernel_normals(sights: Sights, problem: Problem, estimate: Estimate) -> Callable[[int, int], Array]:
-    """The normal equations of one camera's sights, as the kernels give them: (n, K + 1, K + 1) of those from one number
-    to another, the residuals' row last. What it returns raises SolutionError where an observation cannot be projected.
+    """A function of a range of one camera's sights that returns their normal equations (n, K + 1, K + 1) by the
+    kernels, with the residuals' row last. It raises SolutionError where an observation cannot be projected.
     """
     camera = estimate.cameras[sights.keys[0].camera]
     free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting

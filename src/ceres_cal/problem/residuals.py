@@ -1,10 +1,10 @@
-"""What the observations and an estimate disagree about, in measured pixels, one by one.
+"""Residuals: differences between the observations and an estimate, in measured pixels, one by one.
 
-Every observation that an estimate can show, as scalar equations with all their derivatives, in px.
+Also the equations: every observation that an estimate can show, as scalar equations with all their derivatives, in px.
 
-A point gives two equations, one for each image axis, a curve observation one, along the image normal at its foot. Any
-alternative to the model is a column over these equations: what it moves in the image goes in by `direction`, what it
-moves on a target by `built`, the camera by `pose`.
+A point gives two equations, one for each image axis; a curve observation gives one, along the image normal at its foot.
+Any alternative to the model is a column over these equations: displacements in the image enter by `direction`,
+displacements on a target by `built`, motions of the camera by `pose`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ceres_cal.problem.structure import Structure, Tolerance, make_structure
 from ceres_cal.scene import LENSES, Camera, Target, along_track
 
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
-# scripts/accuracy/moves.py. Nothing changes from half to double.
+# scripts/accuracy/moves.py. Halving or doubling changes nothing.
 _STRAY = 0.05
 
 
@@ -46,19 +46,19 @@ class Residuals(Frozen):
         return points, np.abs(self.curves)
 
     def of_rows(self, points: Indices, curves: Indices) -> Residuals:
-        """Those of some of the observations, as if there were no others."""
+        """The residuals of some of the observations, given by rows, as if there were no others."""
         return Residuals(self.points[points], self.curves[curves], self.feet[curves])
 
     def in_sigmas(self, sights: Sights, scales: tuple[float, float]) -> tuple[Array, Array]:
-        """(N,) of the sights' points and (M,) of their curve observations: lengths of the residuals at these noise
-        scales, in standard deviations.
+        """(N,) lengths of the residuals of the sights' points and (M,) of their curve observations, in standard
+        deviations at these noise scales.
         """
         points = np.linalg.norm(self.points[sights.point_rows], axis=1) / (scales[0] * sights.sigma_px)
         return points, np.abs(self.curves[sights.curve_rows]) / (scales[1] * sights.curve_sigma_px)
 
     def misfit(self, sights: Sights, camera: Camera, scales: tuple[float, float]) -> float:
-        """Negative log likelihood of a camera's sights at these noise scales, each observation a stray with a small
-        probability; in nats.
+        """Negative log likelihood, in nats, of a camera's sights at these noise scales, where each observation may,
+        with a small probability, be anywhere in the image.
         """
         width, height = camera.image_size
         points, curves = self.in_sigmas(sights, scales)
@@ -74,14 +74,14 @@ class Residuals(Frozen):
 
 
 def camera_optics(camera: Camera) -> kernels.Optics:
-    """A camera's optics as the kernels take them."""
+    """A camera's optics in the form that the kernels take."""
     lens = camera.lens
-    kind = lens.kind if LENSES.get(lens.kind) is type(lens) else ""  # another's formulas may be others
+    kind = lens.kind if LENSES.get(lens.kind) is type(lens) else ""  # a user's lens of that name may differ
     return kernels.Optics(lens, kind, lens.form, intrinsics_vector(camera), unit_px(camera))
 
 
 def point_columns(sights: Sights, structure: Structure, noise_scale: float | None = None) -> kernels.PointColumns:
-    """The point observations of some sights as the kernels take them; without a noise scale they have no weights."""
+    """The point observations of some sights in the form that the kernels take; without a noise scale, no weights."""
     moved = sights.point_index if len(structure.values) else sights.point_index[:0]
     return kernels.PointColumns(
         sights.point_bounds,
@@ -96,7 +96,9 @@ def point_columns(sights: Sights, structure: Structure, noise_scale: float | Non
 def curve_columns(
     sights: Sights, structure: Structure, feet: Array, noise_scale: float | None = None
 ) -> kernels.CurveColumns:
-    """The curve observations of some sights as the kernels take them, which move the feet (M of the sights,)."""
+    """The curve observations of some sights in the form that the kernels take; these move the feet (M of the
+    sights,).
+    """
     return kernels.CurveColumns(
         sights.curve_bounds,
         structure.tracks(sights),
@@ -120,8 +122,8 @@ def residuals(sights: Sights, estimate: Estimate, feet: Array | None = None) -> 
     """Residuals of every observation in the sights; NaN for rows in none of them.
 
     Args:
-        feet: (M,) where on its track the search for each curve observation's foot starts, such as those of earlier
-            residuals; without them it starts where the ray passes nearest.
+        feet: (M,) initial foot of each curve observation on its track, such as those of earlier residuals; without them
+            the search starts where the ray passes nearest.
     """
     return _residuals(len(sights.observations.points), len(sights.observations.curves), sights, estimate, feet)
 
@@ -162,7 +164,7 @@ def _point_residuals(
 
 
 def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Array:
-    """(M of the sights,) a copy of the feet of their rows, or where the rays pass nearest."""
+    """(M of the sights,) a copy of the feet of their rows, or the places where the rays pass nearest."""
     if not len(sights.curve_rows):
         return np.empty(0)
     if feet is not None:
@@ -175,26 +177,26 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
 
 
 def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
-    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
+    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is no residual."""
     points, curves = residuals.lengths
     points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
     return np.fmin(points, np.inf, out=points), np.fmin(curves, np.inf, out=curves)  # NaN is infinite
 
 
 class Equations(Frozen):
-    """E scalar equations, sight after sight.
+    """E scalar equations, ordered by sight.
 
     Attributes:
-        sights: what can be shown, S of them; none is empty. poses: (S, 3, 4) cam_from_frame. bounds: (S + 1,) where
-            each sight's equations begin. sight: (E,).
+        sights: the S sights, none of them empty. poses: (S, 3, 4) cam_from_frame. bounds: (S + 1,) where each sight's
+            equations begin. sight: (E,) number of the sight.
         observation: (E,) number of the observation: points by row, then curves by row. view: (E,) of the observation.
-        is_curve: (E,). feature: (E,) its `point_index` or, of a curve, its `track_index` (see `Sights`).
-        residual: (E,) px. direction: (E, 2) the image direction it is taken along. pixel: (E, 2) where it should lie.
+        is_curve: (E,). feature: (E,) its `point_index` or, for a curve, its `track_index` (see `Sights`).
+        residual: (E,) px. direction: (E, 2) its direction in the image. pixel: (E, 2) the predicted pixel.
         intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients, skew], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
-            moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
-        built: (E, BUILT) px per metre of what moves it on its target: of a point what `Structure.point_slots` has; of a
-            segment its offset to the left; of an arc x, y and radius; 0 for the rest.
+            moves in the camera frame. place: (E, 3) its place in its sight's frame, m.
+        built: (E, BUILT) px per metre of displacements on the target: for a point those of `Structure.point_slots`; for
+            a segment its offset to the left; for an arc x, y and radius; 0 for the rest.
     """
 
     sights: Sights
@@ -221,21 +223,21 @@ class Equations(Frozen):
         return self.pose[:, 3:]
 
     def along(self, displacement: Array) -> Array:
-        """(E,) px of a displacement (N, 2) of the observations along each direction."""
+        """(E,) px, the component of a displacement (N, 2) of the observations along each direction."""
         return np.asarray(np.sum(displacement[self.observation] * self.direction, axis=1))
 
     def displacement(self, along: Array, count: int) -> Array:
-        """(N, 2) px of so many observations, of which each is moved by (E,) px along its directions."""
+        """(count, 2) px, the displacement of the observations from its components (E,) px along the directions."""
         moved = np.zeros((count, 2))
         np.add.at(moved, self.observation, along[:, None] * self.direction)
         return moved
 
     def of_sights(self, chosen: Mask) -> Mask:
-        """(E,) the equations of the chosen sights."""
+        """(E,) mask of the equations of the chosen sights."""
         return np.asarray(chosen[self.sight])
 
     def slots(self, structure: Structure) -> Indices:
-        """(E, BUILT) which of the structure's offsets are those of `built`, -1 for none."""
+        """(E, BUILT) numbers of the structure's offsets in the order of `built`, -1 for none."""
         slots = np.full((len(self), kernels.BUILT), -1)
         if structure.names:
             slots[~self.is_curve] = structure.point_slots[self.feature[~self.is_curve]]
@@ -251,14 +253,18 @@ class Equations(Frozen):
         return columns if structure.mixing is None else columns @ structure.mixing
 
     def built_along(self, structure: Structure, directions: Array) -> Array:
-        """(E, P) px that directions (Q, P) of the structure's numbers move the equations: its columns times these."""
+        """(E, P) px by which directions (Q, P) of the structure's numbers move the equations: its columns times
+        these.
+        """
         offsets = directions if structure.mixing is None else structure.mixing @ directions
         moves, slots = np.vstack([offsets, np.zeros((1, directions.shape[1]))]), self.slots(structure)
         return np.asarray(sum(self.built[:, k, None] * moves[slots[:, k]] for k in range(slots.shape[1])))
 
 
 def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
-    """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""
+    """(E,) mm along x and (E,) mm along y of the target, equal for both equations of a point; across a curve, y
+    is 0.
+    """
     x, y = np.zeros(len(equations)), np.zeros(len(equations))
     first, second = pairs_of(equations)
     (a, b), (c, d) = equations.built[first, :2].T, equations.built[second, :2].T
@@ -267,18 +273,20 @@ def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
     x[first] = x[second] = 1e3 * (d * p - b * q) / determinant
     y[first] = y[second] = 1e3 * (a * q - c * p) / determinant
     curves = np.flatnonzero(equations.is_curve)
-    x[curves] = 1e3 * values[curves] / np.hypot(*equations.built[curves, :2].T)  # it grows fastest across the curve
+    x[curves] = 1e3 * values[curves] / np.hypot(*equations.built[curves, :2].T)  # the gradient points across the curve
     return x, y
 
 
 def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
-    """The two equations of each point, which follow one another."""
+    """The numbers of the two equations of each point, which are consecutive."""
     first, second = np.flatnonzero(~equations.is_curve).reshape(-1, 2).T
     return first, second
 
 
 def whole_structure(targets: Mapping[str, Target], in_waves: Collection[str] | None = None) -> Structure:
-    """Everything that could be built otherwise than it is drawn; heights of the points of some boards, or of all."""
+    """The structure of everything that could differ from the drawing, with heights of the points of some or all
+    boards.
+    """
     boards = {name for name, target in targets.items() if target.bows}
     waves = boards if in_waves is None else boards & set(in_waves)
     is_board = {name: float(name in boards) for name in targets}
@@ -337,7 +345,7 @@ def of_observations(numbers: Indices, points: AnyArray, curves: AnyArray) -> Any
 def _of_points(
     own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
 ) -> dict[str, AnyArray]:
-    """The columns of the points of one camera's sights, of these numbers and poses."""
+    """The columns of the points of one camera's sights, which have these numbers and poses."""
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 6 + kernels.BUILT))
@@ -362,7 +370,7 @@ def _of_points(
 def _of_curves(
     own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
 ) -> dict[str, AnyArray]:
-    """The columns of their curve observations."""
+    """The columns of the curve observations of one camera's sights."""
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
     curves = curve_columns(own, estimate.structure, there.feet[own.curve_rows])
@@ -384,5 +392,5 @@ def _of_curves(
 
 
 def _sight_of(bounds: Indices) -> Indices:
-    """Which sight each row belongs to."""
+    """The number of the sight to which each row belongs."""
     return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))

@@ -1,8 +1,8 @@
-"""Very many observations of the world in shares, each of which answers with sums.
+"""Very many observations of the world, cut into shares that answer with sums.
 
-A share is some of the rows, in memory or in files, and is asked where it is: by this process, or by a worker that has
-it. What it answers are sums, which do not grow with its rows: a compressed block (design, section 6), normal equations,
-a histogram of residuals. It keeps nothing that an answer depends on but its rows, so one that is lost is made again.
+A share is a part of the rows, in memory or in files, and is queried where it is: in this process, or on a worker. Its
+answers are sums whose size does not grow with its rows: a compressed block (design, section 6), normal equations, a
+histogram of residuals. No answer depends on anything that it keeps except its rows, so a lost share can be made again.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from ceres_cal.problem.reduced import normals_of
 from ceres_cal.problem.residuals import relative_lengths, residuals
 from ceres_cal.scene.targets import Target
 
-# Bins of a histogram of lengths in stated sigmas, to 2e7: from which on one is, and how much wider than the last.
+# Bins of a histogram of lengths in stated sigmas, up to 2e7: lower edge, logarithmic width, number of bins.
 _LEAST, _WIDTH, _BINS = 1e-6, 0.00375, 8192
 
 
 class Histogram(Frozen):
-    """Lengths by their size: (B,) how many, and (B,) the sum of their squares."""
+    """A histogram of lengths: (B,) numbers of lengths, and (B,) sums of their squares."""
 
     counts: Indices
     squares: Array
 
     @classmethod
     def of(cls, lengths: Array) -> Histogram:
-        """Of those that are finite."""
+        """The histogram of the finite lengths."""
         seen = lengths[np.isfinite(lengths)]
         bins = _bin_of(seen)
         squares = np.asarray(np.bincount(bins, seen**2, minlength=_BINS), dtype=float)
@@ -50,35 +50,35 @@ class Histogram(Frozen):
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """The number of lengths."""
         return int(self.counts.sum())
 
     def middle(self) -> float:
-        """Their median; 0 of none."""
+        """The median of the lengths; 0 if there are none."""
         total = np.cumsum(self.counts)
         middle = np.searchsorted(total, total[-1] // 2 + 1)
         return float(_LEAST * np.exp((middle + 0.5) * _WIDTH)) if total[-1] else 0.0
 
     def within(self, bound: float) -> tuple[int, float]:
-        """Of those that are no longer, to the width of a bin: how many, and the sum of their squares."""
+        """Number and sum of squares of the lengths up to the bound, to the width of a bin."""
         last = int(_bin_of(np.array([bound]))[0])
         return int(self.counts[:last].sum()), float(self.squares[:last].sum())
 
 
 def _bin_of(lengths: Array) -> Indices32:
-    """Number of the bin of each."""
+    """The number of the bin of each length."""
     with np.errstate(divide="ignore"):
         place = (np.log(lengths) - np.log(_LEAST)) / _WIDTH
     return np.asarray(np.clip(place, 0.0, _BINS - 1.0), dtype=np.int32)
 
 
 class ResidualSummary(Frozen):
-    """What residuals are like.
+    """A summary of residuals.
 
     Attributes:
-        points, curves: their lengths in stated sigmas.
-        view: (n,) numbers of the views. equations, squares: (n,) of what lies within the bounds in each, how many and
-            their squared lengths. beyond: (n,) how many do not.
+        points, curves: histograms of their lengths in stated sigmas.
+        view: (n,) numbers of the views. equations, squares: (n,) number of equations within the bounds in each view,
+            and sum of their squared lengths. beyond: (n,) number of observations beyond the bounds.
     """
 
     points: Histogram
@@ -94,7 +94,9 @@ class ResidualSummary(Frozen):
 
 
 class ByKey(Frozen):
-    """Matrices by key, and how two of one key become one; None where an observation cannot be projected."""
+    """Matrices by key, and the function that combines two of the same key; None if an observation cannot be
+    projected.
+    """
 
     of: Mapping[Any, Array] | None
     together: Callable[[Array, Array], Array]
@@ -107,11 +109,12 @@ class ByKey(Frozen):
 
 
 class RowSelection(Frozen):
-    """The rows that take part, and those that do not.
+    """The rows that take part, as sums, and those that do not.
 
     Attributes:
-        sums: (2, 3) of points and of curve observations that take part: how many, squared lengths and sigmas, px.
-        rows, sigmas: of those that do not, points and curve observations: numbers, and lengths in stated sigmas.
+        sums: (2, 3) of points and of curve observations that take part: their number, and the sums of squared residuals
+            and of squared sigmas, px^2.
+        rows, sigmas: of points and of curve observations that take no part: row numbers, and lengths in stated sigmas.
     """
 
     sums: Array
@@ -127,27 +130,29 @@ class RowSelection(Frozen):
 
 
 def compressed(*blocks: Array) -> Array:
-    """(K + 1, K + 1) upper triangle with the same products as the rows (N, K + 1) of blocks."""
+    """(K + 1, K + 1) upper triangle with the same products as the stacked rows (N, K + 1) of the blocks."""
     rows = np.vstack(blocks)
     size = rows.shape[1]
     triangle = np.linalg.qr(np.vstack([rows, np.zeros((max(size - len(rows), 0), size))]), mode="r")
     return np.asarray(triangle)
 
 
-# ---- what is asked --------------------------------------------------------------------------------------------------
+# ---- requests -------------------------------------------------------------------------------------------------------
 
-# Of the bounds of outliers: longer residuals are remembered, so that bounds may move.
+# Share of the outliers' bounds above which residuals are remembered one by one, so that the bounds may change.
 _FAR = 0.5
-_ROWS = 1 << 19  # of a share: what is made of them for an answer takes some 100 MB
+_ROWS = 1 << 19  # rows of a share: the intermediate arrays of an answer take some 100 MB
 
 
 class ShareRequest(NamedTuple):
-    """What a share needs to know of a problem to answer.
+    """The request to a share: what it needs to know of a problem.
 
     Attributes:
-        estimate, layout, weighting: of the problem. judged_at: where residuals say which rows take part, and its name.
-        bounds: of points and of curve observations, the lengths in stated sigmas from which on they do not.
-        feet_along: places, by name, at each of which feet were sought from those before: from the last, all others are.
+        estimate, layout, weighting: of the problem. judged_at: name and estimate whose residuals decide which rows take
+            part.
+        bounds: of points and of curve observations, lengths in stated sigmas beyond which they take no part.
+        feet_along: names and estimates at which feet were searched, each from the feet before; the last feet serve all
+            other searches.
     """
 
     estimate: Estimate
@@ -159,11 +164,12 @@ class ShareRequest(NamedTuple):
 
 
 class _RowBounds(Frozen):
-    """What decides which rows take part at a place.
+    """The data that decide which rows take part at an estimate.
 
     Attributes:
-        name: of the place. bounds: that were asked for. far: rows of points and of curve observations beyond a share of
-            them, and their lengths in stated sigmas. sums: (2, 3) of the others, see `RowSelection`.
+        name: of the estimate. bounds: those that were requested. far: rows of points and of curve observations beyond
+            the share _FAR of the bounds, and their lengths in stated sigmas. sums: (2, 3) of the other rows, see
+            `RowSelection`.
     """
 
     name: str
@@ -172,13 +178,13 @@ class _RowBounds(Frozen):
     sums: Array
 
     def will_do(self, asked: ShareRequest) -> bool:
-        """Whether other bounds in the same place need nothing else."""
+        """Whether these data suffice for the estimate and the bounds of another request."""
         return self.name == asked.judged_at[0] and all(
             now >= _FAR * then for now, then in zip(asked.bounds, self.bounds, strict=True)
         )
 
     def taking_part(self, every: Content, asked: ShareRequest) -> tuple[Mask, Mask]:
-        """(n,) of points and (m,) of curve observations."""
+        """(n,) and (m,) masks of the points and of the curve observations that take part."""
         points, curves = np.ones(len(every.points), dtype=bool), np.ones(len(every.curves), dtype=bool)
         for mask, bound, (rows, lengths) in zip((points, curves), asked.bounds, self.far, strict=True):
             mask[rows[~(lengths <= bound)]] = False
@@ -186,7 +192,7 @@ class _RowBounds(Frozen):
 
 
 def _sums(lengths_px: Array, sigma_px: Array) -> tuple[float, float, float]:
-    """How many there are, and the sums of squares."""
+    """The number of rows, the sum of squared lengths and the sum of squared sigmas."""
     return float(len(lengths_px)), float(lengths_px @ lengths_px), float(sigma_px @ sigma_px)
 
 
@@ -198,9 +204,9 @@ class Share:
     """Consecutive rows of points and of curve observations.
 
     Attributes:
-        targets: of all. views: that it shows, the first of them with the number `first_view`. first_rows: of points and
-            of curve observations. points, curves: columns by name. left_out: (n,) of points, (m,) of curve
-            observations: True for what does not count; None where all of them do.
+        targets: all targets. views: those that the share shows; the first has the number `first_view`. first_rows: the
+            first row of points and of curve observations. points, curves: columns by name.
+        left_out: (n,) of points and (m,) of curve observations: True for rows that do not count; None if all count.
     """
 
     targets: Mapping[str, Target]
@@ -212,29 +218,29 @@ class Share:
     left_out: tuple[Mask, Mask] | None = None
 
     def __post_init__(self) -> None:
-        self._feet: tuple[str, NDArray[np.float32]] | None = None  # and the name of where they are
+        self._feet: tuple[str, NDArray[np.float32]] | None = None  # name of the estimate, and the feet found there
         self._judged: _RowBounds | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_feet": None, "_judged": None}
 
     def _world(self) -> Sights:
-        """The sights of the world in it."""
+        """The sights of the world in the share."""
         points, curves = (
             {name: read_rows(column) for name, column in columns.items()} for columns in (self.points, self.curves)
         )
         for columns in (points, curves):
             columns["view"] = columns["view"] - np.int32(self.first_view)
         content = Content(self.targets, {}, self.views, Points(**points), Curves(**curves))
-        sights = sights_of(cast("Observations", content))  # which were checked when they were read
+        sights = sights_of(cast("Observations", content))  # they were checked when they were read
         return sights.take(sights.numbers(placements=(None,)))
 
     def _counted(self, world: Sights) -> Sights:
-        """The same without what does not count."""
+        """The sights without rows that do not count."""
         return world if self.left_out is None else world.used(*(~mask for mask in self.left_out))
 
     def _feet_of(self, sights: Sights, asked: ShareRequest) -> Array:
-        """(m,) where the search for feet starts, known from before or found again: no answer depends on which."""
+        """(m,) initial feet of a search, remembered or found again: no answer depends on which."""
         names = [name for name, _ in asked.feet_along]
         known = self._feet if self._feet is not None and self._feet[0] in names else None
         feet = None if known is None else known[1].astype(float)
@@ -245,8 +251,8 @@ class Share:
         return feet
 
     def _lengths(self, sights: Sights, asked: ShareRequest) -> tuple[Array, Array]:
-        """(n,) and (m,) lengths of the residuals where the rows are judged, in stated sigmas; what decides which take
-        part is remembered.
+        """(n,) and (m,) lengths of the residuals, in stated sigmas, at the estimate at which rows are judged. The data
+        that decide which rows take part are remembered.
         """
         name, estimate = asked.judged_at
         there = residuals(sights, estimate, self._feet_of(sights, asked))
@@ -260,7 +266,7 @@ class Share:
         return lengths
 
     def _judged_by(self, sights: Sights, asked: ShareRequest) -> _RowBounds:
-        """What decides which rows take part, from before where that will do."""
+        """The data that decide which rows take part, remembered ones if they suffice."""
         known = self._judged
         if known is None or not known.will_do(asked):
             self._lengths(sights, asked)
@@ -270,7 +276,7 @@ class Share:
     # ---- answers ----------------------------------------------------------------------------------------------------
 
     def looked(self, asked: ShareRequest) -> ResidualSummary:
-        """What the residuals are like where the rows are judged."""
+        """The summary of the residuals at the estimate at which rows are judged."""
         sights = self._counted(self._world())
         points, curves = self._lengths(sights, asked)
         there, (p, c) = shown_rows(sights), asked.bounds
@@ -288,7 +294,7 @@ class Share:
         )
 
     def blocks(self, asked: ShareRequest, numbers: Mapping[Owner, Array]) -> ByKey:
-        """Compressed blocks (K + 1, K + 1) by sight at some numbers, the residual last."""
+        """Compressed blocks (K + 1, K + 1) by sight for some numbers, with the residual last."""
         answers: dict[SightKey, Array] = {}
         for sight, problem in self._problems(asked):
             cost = SightCost(Run(), sight, problem, asked.estimate)
@@ -299,12 +305,12 @@ class Share:
         return ByKey(answers, compressed)
 
     def normals(self, asked: ShareRequest) -> ByKey:
-        """Normal equations by sight and kind of the rows that take part, at the estimate, see `problem.reduced`."""
+        """Normal equations, by sight and kind, of the rows that take part at the estimate, see `problem.reduced`."""
         every = ((sight, normals_of(sight, problem, asked.estimate)) for sight, problem in self._problems(asked))
         return ByKey({(sight.key, kind): own for sight, kinds in every for kind, own in kinds.items()}, add)
 
     def used(self, asked: ShareRequest) -> RowSelection:
-        """Which rows take part, and how far off the others are."""
+        """The rows that take part, and how far off the others are."""
         world = self._world()
         content, judged = world.observations, self._judged_by(self._counted(world), asked)
         shown = np.split(shown_rows(world), [len(content.points)])
@@ -328,7 +334,7 @@ class Share:
 
 
 def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -> Iterator[Share]:
-    """The observations of targets that lie in the world, in shares of whole views."""
+    """Cut the observations of targets that lie in the world into shares of whole views."""
     points, curves = observations.points, observations.curves
     for first, last in _ranges(observations):
         (p, q), (c, d) = ((int(ends[first]), int(ends[last])) for ends in observations.ends)
@@ -341,7 +347,7 @@ def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -
 
 
 def _ranges(observations: Observations) -> list[tuple[int, int]]:
-    """First view and the one after the last of each share."""
+    """First view of each share, and the one after its last."""
     before = observations.ends[0] + observations.ends[1]
     stops = np.searchsorted(before, np.arange(_ROWS, int(before[-1]), _ROWS))
     return list(pairwise(dict.fromkeys([0, *stops.tolist(), len(observations.views)])))

@@ -1,12 +1,12 @@
-"""The target as built: how far painted lines, points and boards lie from where they should, as numbers under a sigma.
+"""The target as built: how far painted lines, points and boards are off their drawing, as numbers with a tolerance.
 
-One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
-arc its centre's x and y and its radius, for each point its x and y, for each board its warp: two bows, a twist and two
-waves, the height of each of its points besides, and its stretch along columns and along rows; all in metres, 0 is the
-nominal target. Behind them come dimensions of targets that are not known, such as a field's length: each moves the
-offsets of many features at once.
+One vector holds everything observed, shared by all frames and cameras: for each segment its offset to the left; for
+each arc its centre's x and y and its radius; for each point its x and y; for each board its warp (two bows, a twist and
+two waves), the heights of its points beside the warp, and its stretch along columns and along rows. All are in metres,
+and 0 is the nominal target. After them come dimensions of targets that are not known, such as a field's length: each
+moves the offsets of many features at once.
 
-The lengths that targets are drawn by, and how another value of one moves points and curves.
+Also the dimensions by which targets are drawn, and how another value of one displaces points and curves.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from ceres_cal.scene.targets.target import STRETCH as STRETCH
 from ceres_cal.scene.targets.target import WARP as WARP
 
 Kind = Literal["lines", "points", "warp", "heights", "stretch"]
-"""What a tolerance speaks of."""
+"""The kinds of features that a tolerance is about."""
 
 
 class Tolerance(Frozen, eq=True):
     """Standard deviations of a target as built; 0 means exactly as drawn.
 
     Attributes:
-        lines_m: of the offset of each segment, and of each arc's centre and radius.
-        points_m: of each point's x and y.
-        warp_m: of each of WARP, where it is largest: a board's bow along each side, its twist, a wave along each side.
-        heights_m: of the height of each of a board's points, beside its warp.
-        stretch_m: of each of STRETCH: by how much a board is longer along a side, in proportion to the longer one.
-        curve_m: name of a curve -> the same as lines_m, of that one in place of it.
+        lines_m: of the offset of each segment, and of the centre and radius of each arc.
+        points_m: of x and y of each point.
+        warp_m: of each of WARP at its largest: a board's bow along each side, its twist, a wave along each side.
+        heights_m: of the height of each point of a board, beside its warp.
+        stretch_m: of each of STRETCH: by how much a board is longer along a side, in proportion to the longer side.
+        curve_m: name of a curve -> its own standard deviation, which replaces lines_m.
     """
 
     lines_m: float = 0.0
@@ -59,16 +59,16 @@ class Structure(Frozen):
     """The corrections of all targets.
 
     Attributes:
-        names: (Z) "target/feature" or "target/feature.x": what each number moves; the last D are dimensions,
-            "target/dimension". values: (Z,) offsets, m, and lengths of dimensions, m. sigma_m: (Z,) tolerance of each;
-            infinite of a dimension, which has a prior, or none.
-        point_slots: (P, 2 + W + 3) which offset moves each point of all targets: x, y, each of WARP, its own height and
-            each of STRETCH; -1 for none. bends: (P, W + 3) how much of those of its board a point gets, along +z, and
-            along x and y.
-        track_slots: (T, 3) which offset moves each track: of a segment the offset, of an arc x, y and radius.
-            These three are empty where nothing moves at all.
-        slopes: (Q, D) by how much a dimension moves each of the Q offsets: the numbers' own, and those of features that
-            dimensions alone move. drawn_m: (D,) the dimensions of the targets as drawn.
+        names: (Z) "target/feature" or "target/feature.x", what each number moves; the last D are dimensions,
+            "target/dimension". values: (Z,) offsets, m, and dimensions, m. sigma_m: (Z,) tolerance of each; infinite
+            for a dimension, which has a prior or none.
+        point_slots: (P, 2 + W + 3) number of the offset that moves each point of all targets: x, y, each of WARP, its
+            own height and each of STRETCH; -1 for none. bends: (P, W + 3) share of a board's offsets that each point
+            gets, along +z, and along x and y.
+        track_slots: (T, 3) number of the offset that moves each track: for a segment the offset, for an arc x, y and
+            radius. These three are empty if nothing moves at all.
+        slopes: (Q, D) by how much a dimension moves each of the Q offsets: those among the numbers, and those of
+            features that only dimensions move. drawn_m: (D,) the dimensions of the targets as drawn.
     """
 
     names: tuple[str, ...]
@@ -82,28 +82,28 @@ class Structure(Frozen):
 
     @property
     def own(self) -> int:
-        """How many of the numbers are offsets."""
+        """Number of the numbers that are offsets."""
         return len(self.names) - len(self.drawn_m)
 
     @property
     def dimensions(self) -> dict[str, float]:
-        """Name and length, m, of each dimension that is among the numbers."""
+        """Name and length, m, of each dimension among the numbers."""
         return dict(zip(self.names[self.own :], self.values[self.own :].tolist(), strict=True))
 
     @cached_property
     def keys(self) -> tuple[Key, ...]:
-        """(Z) of the numbers."""
+        """(Z) keys of the numbers."""
         kinds = ["structure"] * self.own + ["dimension"] * len(self.drawn_m)
         return tuple(Key.of_structure(name, kind) for name, kind in zip(self.names, kinds, strict=True))
 
     @cached_property
     def sizes_m(self) -> Array:
-        """(Z,) natural sizes: tolerances, and the dimensions as drawn."""
+        """(Z,) natural sizes, m: tolerances, and the dimensions as drawn."""
         return np.concatenate([self.sigma_m[: self.own], self.drawn_m])
 
     @property
     def offsets(self) -> Array:
-        """(Q,) m."""
+        """(Q,) m, all offsets, including those due to dimensions."""
         if not len(self.drawn_m):
             return self.values
         offsets = self.slopes @ (self.values[self.own :] - self.drawn_m)
@@ -112,13 +112,13 @@ class Structure(Frozen):
 
     @cached_property
     def mixing(self) -> Array | None:
-        """(Q, Z) derivatives of the offsets by the numbers; None where these are the offsets."""
+        """(Q, Z) derivatives of the offsets by the numbers; None if the numbers are the offsets."""
         if not len(self.drawn_m):
             return None
         return np.hstack([np.eye(len(self.slopes))[:, : self.own], self.slopes])
 
     def chain(self, before: int, behind: int) -> Array | None:
-        """(before + Q + behind, before + Z + behind) the same among other numbers, which stay what they are."""
+        """(before + Q + behind, before + Z + behind) `mixing` among other numbers, which stay unchanged; or None."""
         if self.mixing is None:
             return None
         rows, columns = self.mixing.shape
@@ -128,26 +128,26 @@ class Structure(Frozen):
         return whole
 
     def places(self, keys: Iterable[Key]) -> list[int]:
-        """Where the numbers of some keys are."""
+        """The positions of the numbers of some keys."""
         return [self.names.index(key.structure_name) for key in keys]
 
     def with_values(self, values: Array) -> Structure:
-        """The same corrections with other numbers."""
+        """The same corrections with other values."""
         return replace(self, values=np.array(values, dtype=float)) if len(self.values) else self
 
     def carrying(self, *others: Structure) -> Structure:
-        """The same corrections with the numbers that others have for them; as drawn where those have none."""
+        """The same corrections with values from others, by name; values that others lack are as drawn."""
         known = dict(zip(self.names[self.own :], self.drawn_m.tolist(), strict=True))
         for other in others:
             known |= zip(other.names, other.values.tolist(), strict=True)
         return self.with_values(np.array(list(map(known.get, self.names, repeat(0.0)))))
 
     def redrawn(self) -> Structure:
-        """The same of targets that are drawn with the dimensions as they are here."""
+        """The same corrections for targets that are drawn with the present dimensions."""
         return replace(self, drawn_m=self.values[self.own :].copy())
 
     def points(self, sights: Sights) -> Array:
-        """(N, 3) where the observed points of the sights lie, m."""
+        """(N, 3) m, the observed points of the sights as built."""
         return self._points(sights.points, sights.point_index)
 
     def tracks(self, sights: Sights) -> Array:
@@ -155,14 +155,14 @@ class Structure(Frozen):
         return self._tracks(sights.tracks, sights.is_arc)
 
     def built_into(self, sights: Sights) -> Sights:
-        """The sights of targets that were drawn as they are built."""
+        """The sights of targets that are drawn as they are built."""
         if not len(self.values):
             return sights
         return replace(sights, points=self.points(sights), tracks=self.tracks(sights))
 
     def built(self, targets: Mapping[str, Target]) -> dict[str, tuple[Array, Array]]:
-        """Where the points (P, 3) of every target lie as built, m, and its tracks (3, C, 3, 3) as `Target.tracks` has
-        them; `targets` are those that the corrections were made for, in that order.
+        """The points (P, 3) of every target as built, m, and its tracks (3, C, 3, 3) in the form of `Target.tracks`.
+        `targets` must be those for which the corrections were made, in the same order.
         """
         points = np.concatenate([target.point_array for target in targets.values()])
         tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
@@ -205,17 +205,17 @@ EXACT = Structure(
     np.empty((0, 1 + len(WARP) + len(STRETCH))),
     np.empty((0, 3), dtype=np.int32),
 )
-"""All targets as drawn."""
+"""The structure of targets exactly as drawn."""
 
 
 def make_structure(
     targets: Mapping[str, Target], tolerances: Mapping[str, Tolerance], dimensions: Collection[str] = ()
 ) -> Structure:
-    """The corrections that the tolerances free, all 0, and dimensions, "target/dimension", as drawn.
+    """Make the corrections that the tolerances free, all 0, with dimensions, "target/dimension", as drawn.
 
     Raises:
-        InputError: a tolerance or a dimension names a target that is not there, a dimension that it does not have or
-            that moves nothing, or a warp of a target that does not bow.
+        InputError: a tolerance or a dimension names a target that does not exist, a dimension that the target does not
+            have or that moves nothing, or a warp of a target that does not bow.
     """
     for name in tolerances:
         if name not in targets:
@@ -245,7 +245,7 @@ def make_structure(
 
 
 def _tolerated(name: str, target: Target, tolerance: Tolerance) -> tuple[list[str], Array]:
-    """Everything of a target that may be offset, and its tolerance, in the order of the solver's numbers."""
+    """Names and tolerances of all offsets that a target may have, in the order of the solver's numbers."""
     if max(tolerance.warp_m, tolerance.heights_m, tolerance.stretch_m) > 0.0 and not target.bows:
         raise InputError(
             "a warp, heights or a stretch are for checkerboards and boards like them: "
@@ -270,7 +270,7 @@ def _parts_of(curve: Curve) -> tuple[str, ...]:
 
 
 def _slots(targets: Mapping[str, Target], place: Indices32) -> tuple[Indices32, Array, Indices32]:
-    """Point slots, bends and track slots, by the place of each offset in the order of `_tolerated`."""
+    """Point slots, bends and track slots, from the position of each offset in the order of `_tolerated`."""
     none = -1
     point_slots, track_slots, start = [], [], 0
     for target in targets.values():
@@ -294,7 +294,7 @@ def _slots(targets: Mapping[str, Target], place: Indices32) -> tuple[Indices32, 
 
 
 def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict[tuple[str, Kind], Indices]:
-    """(target, kind) -> which of the structure's numbers are of it, where there are any."""
+    """(target, kind) -> positions of its numbers in the structure, where there are any."""
     numbers: dict[tuple[str, Kind], Indices] = {}
     if not structure.names:
         return numbers
@@ -315,21 +315,21 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
     return numbers
 
 
-_STEP = 1e-3  # of a dimension: features move in proportion
+_STEP = 1e-3  # relative change of a dimension in a difference: features move in proportion
 
 
 def dimensions_of(targets: Mapping[str, Target]) -> dict[str, float]:
-    """The lengths, m, of all targets, as "target/dimension"."""
+    """The dimensions, m, of all targets, as "target/dimension"."""
     return {f"{name}/{one}": length for name, target in targets.items() for one, length in target.dimensions.items()}
 
 
 def dimension_slopes(
     offsets: Sequence[str], targets: Mapping[str, Target], dimensions: Collection[str]
 ) -> tuple[Array, Array]:
-    """Lengths (D,) of dimensions, m, and how they move features: (Q, D) metres of each offset per metre.
+    """Lengths (D,) of dimensions, m, and derivatives (Q, D) of offsets by them, m per m.
 
     Raises:
-        InputError: a dimension that no target has.
+        InputError: no target has one of the dimensions.
     """
     known, columns = dimensions_of(targets), np.zeros((len(offsets), len(dimensions)))
     place = {name: row for row, name in enumerate(offsets)} if dimensions else {}
@@ -346,7 +346,7 @@ def dimension_slopes(
 
 
 def features_of(target: Target, dimension: str) -> frozenset[str]:
-    """The points and curves that lie elsewhere with another value of a dimension."""
+    """The points and curves that lie elsewhere for another value of a dimension."""
     other = redrawn(target, {dimension: (1.0 + _STEP) * target.dimensions[dimension]})
     moved = (name for name, moved_m in _differences("", target, other) if moved_m != 0.0)
     return frozenset(name[1:].partition(".")[0] for name in moved)
@@ -358,7 +358,7 @@ def redrawn(target: Target, lengths_m: Mapping[str, float]) -> Target:
 
 
 def _differences(name: str, target: Target, other: Target) -> Iterator[tuple[str, float]]:
-    """By how much each number of one target's structure brings it to another, m."""
+    """By how much each structure number, in m, must change to turn one target into another."""
     for feature, curve in target.curves.items():
         there = other.curves[feature]
         if isinstance(curve, Arc) and isinstance(there, Arc):
