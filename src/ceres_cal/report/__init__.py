@@ -1,7 +1,7 @@
-"""The report: one HTML page that says whether a calibration may be trusted, for what, and to how many mm.
+"""The report: one HTML page that says whether a calibration can be trusted, for what, and to how many mm.
 
-The only package that imports the plotting library. The page is loaded when it is first used: every command asks for the
-quality of a calibration, few for the page.
+This is the only package that imports the plotting library. The page is imported when it is first used: every command
+needs the quality of a calibration, few need the page.
 """
 
 from ceres_cal.base.frozen import names_of

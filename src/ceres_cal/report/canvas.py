@@ -1,7 +1,7 @@
-"""Pictures as SVG, all in one style: the only module that imports the plotting library.
+"""SVG pictures in one style; the only module that imports the plotting library.
 
-A picture is drawn for the width at which it is shown, so that its letters are as large as the page's. What has many
-parts goes into one path (`dots`, `strokes`): thousands of them cost a few bytes each and stay sharp in print.
+A picture is drawn for the width at which it is shown, so that its letters have the size of the page's. Many similar
+parts are drawn as one path (`dots`, `strokes`): thousands of them take a few bytes each and stay sharp in print.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from ceres_cal.base import Array, Frozen, replace
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-POINT, CURVE, OUTLIER = "#0072b2", "#009e73", "#d55e00"  # Okabe and Ito's, apart for colour-blind readers too
+# Okabe and Ito's colours, which colour-blind readers can distinguish, too
+POINT, CURVE, OUTLIER = "#0072b2", "#009e73", "#d55e00"
 INK, QUIET, PAINT, FAINT = "#1f2933", "#5b6770", "#b3bcc4", "#e8ecef"
 DIVERGING = ("#a84a00", "#c47039", "#dc9a6d", "#f0cbb0", "#fdfdfd", "#c0dbee", "#8bbadb", "#4a8ebb", "#004f80")
 _THEMED = {
@@ -26,12 +27,12 @@ _THEMED = {
     **dict(zip((POINT, CURVE, OUTLIER), ("point", "curve", "outlier"), strict=True)),
     **{color: f"diverging-{number}" for number, color in enumerate(DIVERGING)},
 }
-"""Colours that the page may have otherwise, in a dark window, and what its style sheet calls them."""
+"""Colours that the page replaces in a dark window, and their names in its style sheet."""
 
 NARROW_IN, WIDE_IN = 3.65, 7.5
-"""A picture in one column, which is what a phone shows, and one across both."""
+"""Widths of a picture in one column, which is what a phone shows, and of one across both, inches."""
 _STYLE: dict[str, Any] = {
-    "svg.fonttype": "none",  # letters stay letters: in the page's own face, to be searched and read aloud
+    "svg.fonttype": "none",  # text remains text, in the page's font, and can be searched and read aloud
     "text.parse_math": False,  # names come from files
     "path.simplify": False,
     "font.family": "DejaVu Sans",
@@ -73,12 +74,12 @@ Draw = Callable[["Axes", float], None]
 
 
 class Hover(Frozen, eq=True):
-    """What is said beside the pointer, by the nearest of places that lie evenly over the axes.
+    """Text beside the pointer, for the nearest of evenly spaced places over the axes.
 
     Attributes:
-        x, y: where the first and the last place are, in units of the axes, and how many there are.
-        values: of each place, row by row; "" where nothing is said.
-        text: of a place, with {x}, {y} and {value} in it. names: of columns and of rows, instead of their numbers.
+        x, y: first and last place in units of the axes, and number of places.
+        values: text of the value at each place, row by row; "" where nothing is shown.
+        text: template with {x}, {y} and {value}. names: of columns and of rows, shown instead of their numbers.
     """
 
     x: tuple[float, float, int]
@@ -89,21 +90,21 @@ class Hover(Frozen, eq=True):
 
     @classmethod
     def of(cls, x: Array, y: Array, values: Iterable[str], text: str) -> Hover:
-        """Of values over a grid x (X,), y (Y,) with even steps, row by row."""
+        """Make the text for values over a grid x (X,), y (Y,) with even steps, row by row."""
         across, down = ((float(axis[0]), float(axis[-1]), len(axis)) for axis in (x, y))
         return cls(across, down, tuple(values), text)
 
     def named(self, columns: Sequence[str], rows: Sequence[str] = ("",)) -> Hover:
-        """With names of the columns and rows in place of numbers."""
+        """Return it with names of the columns and rows in place of numbers."""
         return replace(self, names=(tuple(columns), tuple(rows)))
 
 
 def to_svg(draw: Draw, height: float, width_in: float, name: str, *, whole_file: bool = False) -> str:
-    """An <svg> element to stand in a page, or the text of a file of its own.
+    """Return an <svg> element for a page, or the text of a file of its own.
 
     Args:
-        height: over the width, of the whole.
-        name: one of its own on the page: what the element calls its parts begins with it.
+        height: height over width of the whole picture.
+        name: unique on the page; it prefixes the ids in the element.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -127,18 +128,18 @@ def to_svg(draw: Draw, height: float, width_in: float, name: str, *, whole_file:
 
 
 def _place_of(axes: Axes) -> str:
-    """Left, top, right and bottom of the axes as shares of the picture, and the numbers that are there."""
+    """Left, top, right and bottom of the axes as shares of the picture, and the values of the axes there."""
     box, (left, right), (bottom, top) = axes.get_position(), axes.get_xlim(), axes.get_ylim()
     return " ".join(f"{v:.6g}" for v in (box.x0, 1.0 - box.y1, box.x1, 1.0 - box.y0, left, top, right, bottom))
 
 
 def _for_page(text: str) -> str:
-    """A file's <svg> without what a page does not need, in the page's colours."""
+    """Return a file's <svg> without what a page does not need, in the page's colours."""
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
-    text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # as wide as its place
+    text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # the page sets the width
     named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in named else "", text)
-    text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
+    text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # implied in HTML
     text = re.sub(r' d="[^"]+"', lambda match: re.sub(r"(?<=\.\d\d)\d+", "", match[0]), text)  # a hundredth of a point
     text = re.sub(r"#[0-9a-f]{6}\b", lambda match: _themed(match[0]), text)
     text = text.replace("xlink:href", "href")
@@ -153,34 +154,34 @@ def _themed(color: str) -> str:
 
 
 def strokes(axes: Axes, starts: Array, ends: Array, color: str, width: float, **how: Any) -> None:
-    """Lines from starts (N, 2) to ends (N, 2), of which a longer one is not cut at the border of the axes."""
+    """Draw lines from starts (N, 2) to ends (N, 2); long ones are not clipped at the border of the axes."""
     path = np.full((len(starts), 3, 2), np.nan)
     path[:, 0], path[:, 1] = starts, ends
     axes.plot(*path.reshape(-1, 2).T, color=color, linewidth=width, solid_capstyle="round", **how)
 
 
 def dots(axes: Axes, places: Array, color: str, size: float, **how: Any) -> None:
-    """Round dots of `size` points at places (N, 2): strokes without length."""
+    """Draw round dots of `size` points at places (N, 2), as strokes without length."""
     strokes(axes, places, places, color, size, **how)
 
 
 def crosses(axes: Axes, places: Array, color: str, size: float, **how: Any) -> None:
-    """Crosses of `size` units of the axes at places (N, 2)."""
+    """Draw crosses of `size` units of the axes at places (N, 2)."""
     for slope in (1.0, -1.0):
         reach = 0.5 * size * np.array([1.0, slope])
         strokes(axes, places - reach, places + reach, color, 0.9, **how)
 
 
 def key(axes: Axes, columns: int = 4) -> None:
-    """The legend above the axes."""
+    """Draw the legend above the axes."""
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.2)
 
 
 def plain(value: float, _: float) -> str:
-    """A tick of a logarithmic axis: 0.01, 1, 100, 1e+07."""
+    """Format a tick of a logarithmic axis: 0.01, 1, 100, 1e+07."""
     return f"{value:g}"
 
 
 def clipped(text: str, most: int) -> str:
-    """A label of so many letters at most."""
+    """Shorten a label to so many letters at most."""
     return text if len(text) <= most else f"{text[: most - 1]}…"

@@ -1,7 +1,7 @@
-"""What is said of a result: a document of sections, made once, rendered as text, as JSON or as a page (`report.page`).
+"""Documents: the answer of a command in sections, made once and rendered as text, as JSON or as a page (`report.page`).
 
-A section holds one subject in the three ways in which it is shown: lines for a terminal, data for scripts, and pieces
-of a page. So what is said of one thing stands in one place.
+A section presents one subject in three ways: lines for a terminal, data for scripts, and pieces of a page. So
+everything about one subject is written in one place.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from ceres_cal.report.canvas import Draw, Hover
 
 WIDTH = 100
-"""Of a text for people, in letters."""
+"""Width of a text for users, in letters."""
 _RESULTS = ("verdict", "check", "audit", "jobs", "advice")
-_NOT_MADE = "error"  # what could not be made is said with --quiet as well
+_NOT_MADE = "error"  # what could not be made is printed with --quiet, too
 
 
 def wrapped(*texts: str) -> list[str]:
-    """The texts in lines of WIDTH letters."""
+    """Wrap the texts to lines of WIDTH letters."""
     return [line for text in texts for line in wrap(text, WIDTH)]
 
 
@@ -38,16 +38,16 @@ class Text(Frozen, eq=True):
 
 
 class BulletList(Frozen, eq=True):
-    """A list; each line begins with a mark that its level has: "good", "care", "no" or ""."""
+    """A list; each line has a level that determines its mark: "good", "care", "no" or ""."""
 
     lines: tuple[tuple[str, str], ...]
 
 
 class Table(Frozen, eq=True):
-    """Columns under their heads, which say the unit; the first column names its row.
+    """Columns with heads that state the unit; the first column names the row.
 
-    Of more than `most` rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
-    `printed`: the columns that a terminal has room for, by default all.
+    If there are more than `most` rows, the first ones and the total number are shown. `stacked`: on a phone each row
+    becomes a card. `printed`: columns that are printed in a terminal, by default all.
     """
 
     head: tuple[str, ...]
@@ -58,7 +58,9 @@ class Table(Frozen, eq=True):
     printed: tuple[int, ...] = ()
 
     def lines(self) -> list[str]:
-        """The same for a terminal, the first column to the left; columns in which no row says anything are left out."""
+        """Return the table for a terminal, with the first column left-aligned; columns that are empty in every row are
+        left out.
+        """
         every = self.printed or range(len(self.head))
         printed = [n for n in every if not (n and self.rows) or any(row[n] for row in self.rows)]
         cells = [[row[n] for n in printed] for row in (self.head, *self.rows)]
@@ -69,11 +71,11 @@ class Table(Frozen, eq=True):
 
 
 class Figure(Frozen, eq=True):
-    """A picture with a title, a sentence that says how to read it, and the table behind it; or an image (JPEG), across
-    both columns.
+    """A picture with a title, a sentence that explains it, and the table behind it; or an image (JPEG), across both
+    columns.
 
-    One that has a `wide_height` is drawn twice, for a wide and for a narrow window; heights are over the width. `hover`
-    is what is said beside the pointer; whoever has none finds it in the table.
+    With a `wide_height` it is drawn twice, for a wide and for a narrow window; heights are over the width. `hover` is
+    the text beside the pointer; without a pointer the table has the same values.
     """
 
     name: str
@@ -87,20 +89,20 @@ class Figure(Frozen, eq=True):
 
 
 class Gallery(Frozen, eq=True):
-    """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
+    """Pictures, two beside one another where there is room; a single remaining one has its text beside it."""
 
     pictures: tuple[Figure, ...]
 
 
 class Details(Frozen, eq=True):
-    """Pieces that are there when somebody asks for them."""
+    """Pieces that are folded until the reader opens them."""
 
     title: str
     pieces: tuple[Piece, ...]
 
 
 class Tile(Frozen, eq=True):
-    """One large number: what it is, the number, its unit, and what to know about it."""
+    """One large number: what it is, the number, its unit, and a note on it."""
 
     label: str
     value: str
@@ -110,7 +112,7 @@ class Tile(Frozen, eq=True):
 
 
 class Card(Frozen, eq=True):
-    """One finding: a sentence, what to do where that is known, small facts, and a file beside the page to look at."""
+    """One finding: a sentence, advice if there is any, short facts, and a file beside the page."""
 
     level: str
     sentence: str
@@ -119,7 +121,7 @@ class Card(Frozen, eq=True):
     link: str = ""
 
     def lines(self) -> list[str]:
-        """The same for a terminal."""
+        """Return the card for a terminal."""
         return wrapped(self.sentence, *([f"-> {self.advice}"] if self.advice else []), f"   {'; '.join(self.facts)}")
 
 
@@ -127,7 +129,7 @@ Piece = Text | BulletList | Table | Gallery | Details | tuple[Tile, ...] | Card
 
 
 class Chapter(Frozen, eq=True):
-    """A part of a page under a title; `level` colours it where it is a verdict."""
+    """A part of a page under a title; `level` colours it if it is a verdict."""
 
     name: str
     title: str
@@ -139,12 +141,12 @@ class Chapter(Frozen, eq=True):
 
 
 class Section(Frozen, eq=True):
-    """One subject.
+    """One subject of a document.
 
     Attributes:
-        title: what stands beside its lines in a terminal; without it they stand alone.
-        lines: for people, those of a result whole. data: the same for scripts, numbers at full precision; pieces: the
-            same on a page.
+        title: printed beside its lines in a terminal; without a title only the lines are printed.
+        lines: for users; those of results are wrapped when they are shown.
+        data: the content for scripts, with numbers at full precision. pieces: the content on a page.
     """
 
     title: str = ""
@@ -153,18 +155,18 @@ class Section(Frozen, eq=True):
     pieces: tuple[Piece, ...] = ()
 
     def shown(self) -> Iterator[str]:
-        """Its lines, the title beside the first."""
+        """Yield its lines, with the title beside the first one."""
         lines = chain.from_iterable(map(wrapped, self.lines)) if self.title in _RESULTS else self.lines
         for number, line in enumerate(lines):
             yield f"{'' if number else self.title:9} {line}" if self.title else line
 
 
 class Document(Frozen, eq=True):
-    """What a command answers: sections in the order in which they are read.
+    """The answer of a command: sections in reading order.
 
     Attributes:
         exit_code: 0, or 1 where the answer is no or a part of it could not be made.
-        headline: the answer in a line, where it is not the first of its result's.
+        headline: the answer in one line, if it is not the first line of the result.
     """
 
     sections: tuple[Section, ...]
@@ -172,13 +174,13 @@ class Document(Frozen, eq=True):
     headline: str = ""
 
     def text(self, titles: Collection[str] | None = None) -> str:
-        """For people; of the sections with one of these titles, by default of all."""
+        """Return the text for users, of the sections with one of these titles, by default of all."""
         kept = (one for one in self.sections if titles is None or one.title in titles)
         return "\n".join(line for one in kept for line in one.shown())
 
     @property
     def one_line(self) -> str:
-        """The answer in one line, as with --quiet: the verdict, or what is said first; and what could not be made."""
+        """The answer in one line, as with --quiet: the verdict, or else the first line; and what could not be made."""
         first = sorted(self.sections, key=lambda one: one.title not in _RESULTS)
         lines = (line for one in first for line in one.lines if line.strip())
         failed = (" ".join(one.shown()) for one in self.sections if one.title == _NOT_MADE and one.lines)
@@ -186,7 +188,7 @@ class Document(Frozen, eq=True):
 
     @property
     def data(self) -> dict[str, Any]:
-        """For scripts: what infinite or not a number is, becomes null in JSON."""
+        """The data for scripts; infinity and NaN become null in JSON."""
         joined: dict[str, Any] = {}
         for one in self.sections:
             joined = _joined(joined, one.data)

@@ -1,4 +1,4 @@
-"""What the residuals say: sections of a diagnosis, and the chapter of a report behind its verdict."""
+"""Results of the residuals: sections of a diagnosis, and the chapter of a report after its verdict."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _NEW_DATA = (
 def diagnosis_sections(
     diagnosis: Diagnosis, choices: Mapping[str, LensChoice] | None, options: Options
 ) -> Iterator[Section]:
-    """The verdict, the findings by size, then tables; everything but the table of single observations."""
+    """Yield the verdict, the findings by size, then tables: everything except the table of single observations."""
     summaries = diagnosis.summaries
     own = ("model_error", "conflicts", "new_data", "tests", "false_alarm_rate", "findings")
     said = _verdict(diagnosis)
@@ -48,7 +48,9 @@ def diagnosis_sections(
 
 
 def chapter(diagnosis: Diagnosis, choices: Mapping[str, LensChoice] | None, options: Options) -> Chapter:
-    """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
+    """Make the chapter with findings, the largest first, the remaining noise, and the held-out errors if they were
+    computed.
+    """
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
     alternatives = counted(diagnosis.tests, "alternative")
     tested = f"{alternatives} of the model were tested. Correct data give a finding in {rate} of cases."
@@ -137,7 +139,7 @@ def _outliers(table: ResidualTable) -> Section:
 
 
 def _held_out(choices: Mapping[str, LensChoice], options: Options) -> Section:
-    """Which lens of each camera predicts parts that it was not fitted to best, and whether the calibration has it."""
+    """Section on which lens of each camera predicts held-out parts best, and whether the calibration has that lens."""
     lines, data, pieces = list[str](), {}, list[Piece]()
     for name, choice in choices.items():
         current, camera = label_of(options.of_camera(name)), f"camera {name!r}: " if len(choices) > 1 else ""
@@ -152,7 +154,7 @@ def _held_out(choices: Mapping[str, LensChoice], options: Options) -> Section:
 
 
 def summary_table(head: str, summary: Summary, rows: Sequence[int], names: Sequence[str] = ()) -> Table:
-    """Some groups of observations, by their numbers; `names`: of them, where the summary's own are not shown."""
+    """Table of some groups of observations, given by number; `names` replaces the summary's own names."""
     of_points, of_curves = summary.points_rms_px, summary.curves_rms_px
     cells = tuple(
         (
@@ -171,7 +173,7 @@ def summary_table(head: str, summary: Summary, rows: Sequence[int], names: Seque
 
 
 def _summary(summary: Summary, *, by_size: bool) -> list[str]:
-    """Rows of one summary: all, or those of the largest residuals beside their noise."""
+    """Rows of one summary: all of them, or those with the largest residuals relative to the noise."""
     order: Sequence[int] = range(len(summary.names))
     if by_size:
         order = np.argsort(-np.nan_to_num(summary.rms_sigma), kind="stable")[:_MOST_ROWS].tolist()
@@ -181,7 +183,7 @@ def _summary(summary: Summary, *, by_size: bool) -> list[str]:
 
 
 def _leverage(table: ResidualTable) -> Iterator[str]:
-    """The observations that the answer hangs on most."""
+    """Yield the observations with the largest influence on the result."""
     leverage = np.where(table.inlier, np.nan_to_num(table.leverage), 0.0)
     for i in np.argsort(-leverage, kind="stable")[:3]:
         view, feature = table.views[table.view[i]], table.features[table.feature[i]]

@@ -1,6 +1,6 @@
-"""May a calibration be trusted, for what, to how many mm: the one verdict of screens, reports and `--json`.
+"""The verdict of terminal, reports and `--json`: whether a calibration can be trusted, for what, and to how many mm.
 
-What speaks for it and against it has a level each: good, care, no, or "" where it is only said.
+Each reason for or against has a level: good, care, no, or "" for a mere statement.
 """
 
 from __future__ import annotations
@@ -20,40 +20,41 @@ from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.targets.target import PAINT_WANDERS
 
 GOOD_MM, CARE_MM = 10.0, 50.0
-"""95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
-care, beyond it not to be used. Where lines are painted wider both are as many times as large.
+"""Limits of the distance within which 95 % of located points are: up to the first (the width of a painted line) the
+level is good, up to the second care, beyond it no. If lines are painted wider, both are as many times as large.
 """
 MOST_PLACES = 0.95
-"""Share of the places seen that the verdict speaks of. The worst one is named beside it where it is much worse."""
+"""Share of the places seen to which the verdict applies. The worst place is named as well where it is much worse."""
 GOOD_PX, CARE_PX = 2.0, 10.0
-"""The same of places in the picture, of a camera that sees no field: a pixel shows about 5 mm of one."""
+"""The corresponding limits in the picture, px, for a camera that sees no field: a pixel shows about 5 mm of one."""
 LARGE_NOISE = 3.0
-"""Times the stated sigmas, from which on something else than noise is in it: no number of mm is promised."""
+"""Ratio of the noise to the stated sigmas from which on it contains more than noise: no number of mm is promised."""
 MOVED, MOVED_FAR = 1.0, 3.0
-"""Standard deviations by which a named fault moves a result, from which on it is to be used with care, or not at all
-where more than GOOD_MM are left of it."""
+"""Standard deviations by which a named fault moves a result: from the first on the level is care, from the second on
+no, unless the accuracy including the fault is GOOD_MM or better.
+"""
 _UNJUDGED = "its residuals could not be judged"
 _ORDER = ("good", "care", "no")
 
 
 def level_of(radius_mm: float, times: float = 1.0) -> str:
-    """By GOOD_MM and CARE_MM, so many times; nothing seen is nothing to trust."""
+    """Level by GOOD_MM and CARE_MM, scaled by `times`; NaN (nothing seen) is "no"."""
     return "good" if radius_mm <= GOOD_MM * times else "care" if radius_mm <= CARE_MM * times else "no"
 
 
 def paint_over_usual(quality: Quality) -> float:
-    """How many times as wide as GOOD_MM the lines of the fields are painted, at least 1: of a football pitch 12."""
+    """Ratio of the width of the fields' lines to GOOD_MM, at least 1; 12 for a football pitch."""
     widths = [1e3 * curve.width_m for target in quality.fields for curve in target.curves.values()]
     return max(1.0, median(np.array(widths)) / GOOD_MM) if widths else 1.0
 
 
 def level_of_px(radius_px: float) -> str:
-    """By GOOD_PX and CARE_PX; nothing observed is nothing to trust."""
+    """Level by GOOD_PX and CARE_PX; NaN (nothing observed) is "no"."""
     return "good" if radius_px <= GOOD_PX else "care" if radius_px <= CARE_PX else "no"
 
 
 def worst(*levels: str) -> str:
-    """The last of them in the order good, care, no."""
+    """Return the worst level, in the order good, care, no."""
     return max(levels, key=_ORDER.index)
 
 
@@ -70,27 +71,27 @@ class Judgement(Struct, frozen=True):
 
 
 def judge_quality(quality: Quality) -> Judgement:
-    """The verdict on a calibration."""
+    """Return the verdict on a calibration."""
     reasons = tuple(grounds(quality))
     level, headline = _headline(quality, reaches(quality), worst("good", *(mark for mark, _ in reasons if mark)))
     return Judgement(level, headline, reasons)
 
 
 def is_against(finding: Finding) -> bool:
-    """Whether it says that the calibration is wrong: a wrong label did no harm, noise and dependence of errors
+    """Whether a finding says that the calibration is wrong. A wrong label did no harm, and noise and correlated errors
     are in the standard deviations.
     """
     return finding.wrong in ("model", "calibration")
 
 
 def disputed(quality: Quality) -> bool:
-    """Whether what was known beforehand is contradicted; a tolerance alone leaves the calibration as it is."""
+    """Whether prior knowledge is contradicted; a contradicted tolerance alone does not affect the calibration."""
     return any(conflict.kind != "tolerance" for conflict in quality.calibration.conflicts)
 
 
 def noise_ratio(quality: Quality) -> float:
-    """The noise over what was stated, the larger one of points and curves; 0 where nothing was stated, and of curves
-    where paint that wanders as it usually does makes as much: photographs state what their pixels do.
+    """Ratio of the noise to the stated sigmas, the larger one of points and curves; 0 where none were stated. Curves
+    are ignored if the usual unevenness of paint explains the excess: sigmas of photographs describe the pixels only.
     """
     every = () if quality.diagnosis is None else quality.diagnosis.noise
     paint_mm = 1e3 * PAINT_WANDERS * min((target.usual_aside_m for target in quality.fields), default=0.0)
@@ -101,7 +102,9 @@ def noise_ratio(quality: Quality) -> float:
 
 
 def misfit_mm(quality: Quality) -> float:
-    """By how much a refit to new data would move it, rms mm; 0 where it holds on them, or they are its own."""
+    """Rms distance, mm, by which a refit to new data would move places; 0 if the calibration holds, or for its own
+    data.
+    """
     return _largest_mm([finding for finding in quality.findings if finding.wrong == "calibration"])
 
 
@@ -110,7 +113,7 @@ def _largest_mm(findings: Sequence[Finding]) -> float:
 
 
 def of_the_solve(calibration: Calibration, table: ResidualTable | None = None) -> Iterator[tuple[str, str]]:
-    """Level and line of what speaks against it; nothing where nothing was solved. `table`: of other observations."""
+    """Yield level and line of what speaks against a solve, if there was one. `table`: of other observations."""
     many_outliers = 0.3
     out = len(calibration.outliers)
     share = out / max(calibration.fit.points + calibration.fit.curves + out, 1)
@@ -123,7 +126,7 @@ def of_the_solve(calibration: Calibration, table: ResidualTable | None = None) -
 
 
 def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
-    """Level and line of each."""
+    """Yield the level and line of each reason."""
     calibration = quality.calibration
     if calibration.converged:
         yield "good", "The solve converged."
@@ -146,7 +149,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     for text in calibration.warnings:
         if text not in known:
             yield "no" if text in calibration.ambiguities else "care", ended(text)
-    yield from (("", ended(text)) for text in calibration.remarks)  # which are in every standard deviation
+    yield from (("", ended(text)) for text in calibration.remarks)  # remarks are included in every standard deviation
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
@@ -167,7 +170,7 @@ def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
 
 
 def _of_faults(quality: Quality) -> tuple[str, str]:
-    """Level and line of what is wrong with the model, by how far it moves a result."""
+    """Return level and line of the model's faults, by how far they move a result."""
     sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
     left_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
     level = (
@@ -190,16 +193,17 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
         return
     if quality.uncertainty.widening:
         yield "", ended(quality.uncertainty.widening)
-    some = 0.005  # of a probability that is said
+    some = 0.005  # least probability that is stated
     floors = [one for one in quality.calibration.effects if not one.is_solved and one.probability >= some]
     likely = [f"'{one.kind} by {mm(1e3 * one.sigma)}' is {100.0 * one.probability:.0f} % likely" for one in floors]
     if likely:
         included = "the accuracy includes this, and --as-drawn leaves it out"
         yield "", f"By these observations {' and '.join(likely)}: {included}."
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
-    # What they do to places is in the maps, and what to the picture, in what is said of it.
+    # Their effect on places is included in the maps, that on the picture in its radius.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
-    yield from ((level, f"{words}.") for words in weak[:most_lines])  # which begin with names as they are
+    # these begin with names, which are not capitalised
+    yield from ((level, f"{words}.") for words in weak[:most_lines])
     if len(weak) > most_lines:
         yield level, f"{len(weak) - most_lines} more such directions: see the numbers."
     if not weak and not disputed(quality):
@@ -214,12 +218,14 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
 
 
 class Reach(Struct, frozen=True):
-    """How well places at one height are told, over all stations.
+    """Accuracy of places at one height, over all stations.
 
     Attributes:
-        height_m: of the places. radius_mm: 95 % of the points located are nearer, at 95 of 100 of the places that are
-            seen; worst_mm: at the worst one. Infinite where it cannot be told, NaN where no image shows any.
-        worst_at: of that place. level: "good", "care" or "no". is_worse: whether the worst place is of another level.
+        height_m: height of the places.
+        radius_mm: distance within which 95 % of located points are, at 95 of 100 of the places seen; infinite where it
+            is unknown, NaN where no image shows a place.
+        worst_mm: the same at the worst place. worst_at: the worst place.
+        level: "good", "care" or "no". is_worse: whether the worst place has another level.
     """
 
     height_m: float
@@ -239,7 +245,7 @@ class Reach(Struct, frozen=True):
 
 
 def reaches(quality: Quality) -> tuple[Reach, ...]:
-    """One for each of HEIGHTS_M, with what is named as wrong counted; none where no station sees the world."""
+    """Return the accuracy at each of HEIGHTS_M, including named faults; empty where no station sees the world."""
     if not quality.maps:
         return ()
     times = paint_over_usual(quality)
@@ -250,7 +256,7 @@ def reaches(quality: Quality) -> tuple[Reach, ...]:
 
 
 def reach(height_m: float, maps: Sequence[FieldMap], times: float) -> Reach:
-    """A corner of the picture beyond the paint, of which little is known, is named and does not condemn the rest."""
+    """Summarise maps. A little known corner of the picture beyond the paint lowers the level to care at most."""
     radii = np.concatenate([one.radius_95_mm.ravel() for one in maps])
     places = np.concatenate([one.places for one in maps])[~np.isnan(radii)]
     radii = radii[~np.isnan(radii)]
@@ -264,7 +270,7 @@ def reach(height_m: float, maps: Sequence[FieldMap], times: float) -> Reach:
 
 
 def focal(quality: Quality) -> Iterator[Verdict]:
-    """What is known of phi of each camera."""
+    """Yield the verdict on each camera's phi."""
     for name in quality.observations.cameras:
         verdict = quality.verdicts.get(("camera", name, "phi"))
         if verdict is not None:
@@ -272,12 +278,12 @@ def focal(quality: Quality) -> Iterator[Verdict]:
 
 
 def level_of_verdict(verdict: Verdict) -> str:
-    """Good where it is known, care where it is weak."""
+    """Level of a number: good where it is known, care where it is weak."""
     return {"known": "good", "weak": "care"}.get(verdict.verdict, "no")
 
 
 def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple[str, str]:
-    """Level and headline."""
+    """Return level and headline."""
     if quality.uncertainty is None:
         return "no", "Not to be used: this is the closed form of the paper. Nothing was minimised."
     if not every:
@@ -304,7 +310,7 @@ def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple
 
 
 def _except_at(every: Sequence[Reach]) -> str:
-    """The worst place, where it is of another level than most; "" where it is not."""
+    """Words on the worst place if its level differs from that of most places; else ""."""
     worse = [one for one in every if one.is_worse]
     if not worse:
         return ""
@@ -314,23 +320,23 @@ def _except_at(every: Sequence[Reach]) -> str:
 
 
 def _short_of(reach: Reach) -> str:
-    """That places there are not known well enough."""
+    """Words that places there are not known well enough."""
     how = f"are known to {mm(reach.radius_mm)} only" if np.isfinite(reach.radius_mm) else "are not known"
     return f"places {reach.where} {how}"
 
 
 def promises(quality: Quality) -> bool:
-    """Whether the headline states any accuracy: where it does not, no number of mm is shown as good."""
+    """Whether the headline states an accuracy; if not, no number of mm is shown as good."""
     return judge_quality(quality).level != "no" and not _doubt(quality)
 
 
 def _doubt(quality: Quality) -> str:
-    """What keeps a headline from promising anything; "" where nothing does."""
+    """Return the reason why a headline states no accuracy; "" if there is none."""
     if quality.undiagnosed:
         return _UNJUDGED
     if disputed(quality):
         return "the observations contradict what was stated beforehand"
-    if quality.calibration.ambiguities:  # 3.8 m apart once, each known to 42 mm
+    if quality.calibration.ambiguities:  # once two solutions were 3.8 m apart, each known to 42 mm
         return "what a station shows is seen alike from another place"
     if noise_ratio(quality) >= LARGE_NOISE:
         return f"the noise is {short(noise_ratio(quality))} times the stated sigma"

@@ -1,4 +1,4 @@
-"""The model drawn into photographs of the observed frames: does it lie on the paint?"""
+"""The model drawn into photographs of the observed frames, to see whether it lies on the paint."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _READING = (
 
 
 def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter:
-    """The chapter: of each station its first frame, of a field where it saw one, then those with the largest residuals,
-    at most four.
+    """Make the chapter with at most four photographs: the first frame of each station (of a field if it saw one), then
+    those with the largest residuals.
 
     Raises:
         InputError: an image cannot be read, or has not the size of its camera.
@@ -51,20 +51,20 @@ def _chosen(material: Material, frames: list[Frame]) -> list[Frame]:
 
 
 def first_of_each(frames: Iterable[Frame]) -> dict[str, Frame]:
-    """By station: the first frame that shows the world, or of boards alone where none does."""
+    """By station: the first frame that shows the world, or boards alone where none does."""
     world_first = sorted(frames, key=lambda frame: all(placement is not None for _, placement in frame.shown))
     return {frame.station: frame for frame in reversed(world_first)}
 
 
 def _rms_px(material: Material, frame: Frame) -> float:
-    """Of the residuals that took part in a frame; 0 without any."""
+    """Root mean square of a frame's residuals of inliers, px; 0 without any."""
     table = material.diagnosis.table
     distances = table.distance_px[np.isin(table.view, frame.views) & table.inlier]
     return rms(distances, 0.0)
 
 
 def _picture(material: Material, photographs: FramePhotographs, frame: Frame, number: int) -> Figure:
-    widest_px, most_bytes = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
+    widest_px, most_bytes = 1400, 230_000  # limits of one picture: four of them are 1.2 MB in a page
     calibration, path = material.calibration, photographs.paths[frame.name, frame.station]
     model = model_of(calibration, frame)
     owner = calibration.estimate.stations[frame.station].camera
@@ -89,7 +89,7 @@ def _picture(material: Material, photographs: FramePhotographs, frame: Frame, nu
 
 
 def _before(material: Material, photographs: FramePhotographs, frame: Frame) -> Iterator[tuple[Calibration, str]]:
-    """What to compare with, as far as it knows the frame."""
+    """Yield the calibration to compare with and its name, if it knows the frame."""
     before, name = photographs.before, "the calibration before"
     if before is None and not isinstance(material.closed_form, str):
         before, name = material.closed_form[0], "the paper's closed form"

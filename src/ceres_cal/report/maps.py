@@ -1,4 +1,4 @@
-"""Maps over the field and over the image: how far off a located point may be, or where two calibrations differ."""
+"""Maps over the field and over the image: the accuracy of located points, or the difference of two calibrations."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SERIES = (
     (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
     (1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 3.9, 4.7, 5.6, 6.8, 8.2),
 )
-"""Rounder steps first; the finer ones where the others would leave too few lines."""
+"""Steps of contour levels: the rounder series first; finer ones where the others would leave too few lines."""
 _TABLE_SIZE = 7, 6
 _DOT, _DOT_ALPHA = 1.1, 0.45
 LABEL = "95 % within, mm"
@@ -45,12 +45,13 @@ def field_drawing(
     worst_m: tuple[float, float] | None = None,
     observed: Array | None = None,
 ) -> tuple[Draw, float]:
-    """A map over the field, with the field's lines, the border of the image, and the camera on top; and its height.
+    """Return a map over the field, with the field's lines, the border of the image and the camera on top, and its
+    height.
 
     Args:
-        grid: x (X,) and y (Y,) m. values: (Y, X) mm, NaN where nothing is shown, infinite where nothing can be said.
-        label: of the scale of colours. camera: that is posed over the fields; height_m: of the map.
-        worst_m: the place that is ringed, where there is one. observed: (N, 2) m, where observations lie.
+        grid: x (X,) and y (Y,) m. values: (Y, X) mm, NaN where nothing is shown, infinite where the value is unknown.
+        label: of the colour scale. camera: posed over the fields. height_m: of the map.
+        worst_m: place that is marked by a ring, if any. observed: (N, 2) m, places of observations.
     """
     x_m, y_m = grid
 
@@ -75,7 +76,7 @@ def field_drawing(
 
 
 def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> None:
-    """The colours of a map (Y, X) over x and y, and lines of equal amounts with what they are."""
+    """Draw the colours of a map (Y, X) over x and y, and labelled contour lines."""
     most_lines = 4
     scale.fill(axes, *grid, values)
     known = np.where(np.isinf(values), np.nan, values)
@@ -88,7 +89,7 @@ def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> 
 
 
 def levels_of(*maps: Array) -> Array:
-    """Lines of equal amounts: round numbers around everything that the maps (Y, X) show, at least three."""
+    """Contour levels: round numbers that cover all values of the maps (Y, X), at least three."""
     fewest_steps = 6
     values = np.concatenate([one[np.isfinite(one)] for one in maps])
     if not len(values):
@@ -105,7 +106,7 @@ def levels_of(*maps: Array) -> Array:
 
 
 def plot_map(one: FieldMap | ImageMap, axes: Axes) -> None:
-    """95 % radii over the field, m, or over the image, px, in somebody's own axes."""
+    """Draw 95 % radii over the field, m, or over the image, px, into the user's own axes."""
     if isinstance(one, FieldMap):
         fill(axes, MM, (one.x_m, one.y_m), one.radius_95_mm)
         axes.set(aspect="equal", xlabel="x, m", ylabel="y, m")
@@ -120,7 +121,7 @@ def plot_map(one: FieldMap | ImageMap, axes: Axes) -> None:
 
 
 def map_figure(material: Material, station: str, number: int) -> Figure:
-    """One map of one station over the field, at one of its heights."""
+    """Make the map of one station over the field, at one of its heights."""
     one, drawn = material.maps[station][number], material.drawn_maps[station][number]
     posed = material.calibration.stations[station]
     draw, height = field_drawing(
@@ -151,7 +152,7 @@ def _named(material: Material, station: str) -> str:
 
 
 def _within(places: Array, one: FieldMap) -> Array:
-    """Those that the map shows."""
+    """Return the places that the map shows."""
     low, high = (one.x_m[0], one.y_m[0]), (one.x_m[-1], one.y_m[-1])
     with np.errstate(invalid="ignore"):
         return np.asarray(places[np.all((places >= low) & (places <= high), axis=1)])
@@ -175,10 +176,10 @@ def grid_table(
     most: tuple[int, int] = _TABLE_SIZE,
     shown: Callable[[float], str] = short,
 ) -> Table:
-    """Some of the values (Y, X) of a map, the first row at the top.
+    """Table of some values (Y, X) of a map, the first row at the top.
 
     Args:
-        place: how a place on its axes is written. most: columns and rows. shown: how a value is written.
+        place: format of a place on the axes. most: columns and rows. shown: format of a value.
     """
     columns, rows = (evenly(len(axis), number).tolist() for axis, number in zip((x, y), most, strict=True))
     cells = [["∞" if np.isinf(value) else shown(value) for value in values[r, columns].tolist()] for r in rows]
@@ -200,8 +201,8 @@ def _over_image(
     observed: Array,
     scale: Scale,
 ) -> Figure:
-    """Radii (Y, X) at x (X,), y (Y,) px over one image, with observations (N, 2) px on top, and how much of it they
-    cover; `name`: of the figure, its title, and what it shows.
+    """Figure of radii (Y, X) at x (X,), y (Y,) px over one image, with observations (N, 2) px on top and how much of
+    the image they cover; `name`: of the figure, its title, and what it shows.
     """
     (width, height), unit = image_size, scale.unit
     counts, _ = counts_of_parts(observed, image_size)
@@ -225,7 +226,7 @@ def _over_image(
 
 
 def image_figure(material: Material, station: str) -> Figure:
-    """The map of one station on the floor, over its image instead of the field."""
+    """Make the map of one station on the floor, over its image instead of the field."""
     posed = material.calibration.stations[station]
     x, y = image_grid(posed.image_size)
     pixels = grid_places(x, y)
@@ -242,7 +243,7 @@ def image_figure(material: Material, station: str) -> Figure:
 
 
 def lens_image_figure(material: Material, name: str) -> Figure:
-    """How well a camera that has no place over a field knows its own image, px."""
+    """Make the map of the accuracy in its own image, px, of a camera that has no place over a field."""
     assert material.uncertainty is not None
     known = material.uncertainty.map_px(name)
     stations = [s for s, owner in material.observations.stations.items() if owner == name]
@@ -260,7 +261,7 @@ def lens_image_figure(material: Material, name: str) -> Figure:
 
 
 def comparison_svg(comparison: Agreement, before: Calibration) -> str:
-    """The map of one station's differences as a file of its own, over the field as the first calibration sees it."""
+    """Return the map of one station's differences as an SVG file, over the field as the first calibration sees it."""
     assert comparison.change is not None
     (over,) = comparison.change.maps
     label = f"{comparison.name}, {at_height(over.height_m)}: difference, mm ({over.mean_mm:.2f} on average)"

@@ -1,4 +1,4 @@
-"""A calibration's numbers and how well each is known: sections of its answer, and the chapter of its report."""
+"""Numbers of a calibration and their accuracy: sections of a command's answer, and the chapter of its report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _Row = tuple[str, ...]
 
 
 def number_sections(quality: Quality) -> Iterator[Section]:
-    """The fit, the lens, and every number of cameras, stations and targets."""
+    """Yield the fit, the lens, and every number of cameras, stations and targets."""
     calibration = quality.calibration
     yield _fit(calibration)
     several = len(calibration.lens_choices) > 1
@@ -52,7 +52,7 @@ def number_sections(quality: Quality) -> Iterator[Section]:
 
 
 def observed(observations: Observations) -> list[str]:
-    """How many observations there are, and of what."""
+    """Return lines on the number of observations, and what they are of."""
     count = observations.counts
     owners = [plural(count[f"{word}s"], word) for word in ("view", "camera", "station", "placement")]
     return [
@@ -77,7 +77,7 @@ def _fit(calibration: Calibration) -> Section:
 
 
 def outliers(calibration: Calibration) -> Section:
-    """What was taken out, by feature."""
+    """Section on the outliers, by feature."""
     fit, total = calibration.fit, len(calibration.outliers)
     groups = (entry.reason.partition(":")[0] for entry in calibration.outliers if entry.is_of_whole)
     single = (f"{entry.kind} {entry.feature}" for entry in calibration.outliers if not entry.is_of_whole)
@@ -93,7 +93,7 @@ def outliers(calibration: Calibration) -> Section:
 
 
 def stopped(calibration: Calibration) -> Section:
-    """How the solve ended."""
+    """Section on how the solve ended."""
     if not calibration.rounds:
         return Section("stopped", [calibration.termination])
     how = "converged" if calibration.converged else "did not converge"
@@ -103,8 +103,8 @@ def stopped(calibration: Calibration) -> Section:
 
 
 def warnings(calibration: Calibration) -> Iterator[str]:
-    """What to know of it, and what may be wrong with the observations."""
-    large_scale = 4.0  # from where on a warning is due
+    """Yield what to know about the calibration, and what may be wrong with the observations."""
+    large_scale = 4.0  # ratio of the noise to the stated sigmas above which a warning is given
     yield from (*calibration.warnings, *calibration.remarks)
     yield from (text for _, text in of_the_solve(calibration))
     scale = max(calibration.fit.scales)
@@ -116,7 +116,7 @@ def warnings(calibration: Calibration) -> Iterator[str]:
 
 
 def lens_choice(camera: str, choice: LensChoice) -> Section:
-    """What was chosen, over what, by how much; `camera`: named where there are several."""
+    """Section on the chosen lens, the alternatives, and the differences; `camera` is given where there are several."""
     rows = []
     for one in choice.tried:
         cells = (DASH, DASH, DASH, one.failed)
@@ -139,7 +139,7 @@ def _camera(quality: Quality, name: str) -> Section:
     camera = quality.calibration.cameras[name]
     (width, height), (cx, cy) = camera.image_size, camera.principal_point
     units = {"phi": "px", "cx": "px", "cy": "px"}
-    plain = {"aspect": 1.0, "skew": 0.0}  # of most cameras
+    plain = {"aspect": 1.0, "skew": 0.0}  # values for most cameras
     values = {"phi": camera.phi, "cx": cx, "cy": cy, "aspect": camera.aspect, "skew": camera.skew, **camera.lens.listed}
     known, alone = (
         {one: every.get(("camera", name, one)) for one in values} for every in (quality.verdicts, quality.undisputed)
@@ -161,8 +161,8 @@ def _disputed(quality: Quality, of: str = "") -> Iterator[str]:
 
 
 def _listed(title: str, about: str, rows: Iterable[_Row], notes: Sequence[str] = ()) -> Section:
-    """Numbers, how well each is known, and notes below them."""
-    narrow = (0, 1, 2, 4, 5)  # without what the model alone says, which only the page has room for
+    """Section of numbers, how well each is known, and notes below them."""
+    narrow = (0, 1, 2, 4, 5)  # without the column of the model alone, for which only the page has room
     table = Table(_HEAD, tuple(rows), f"{sentence(title)} {about}", stacked=True, printed=narrow)
     return Section(title, [about, *table.lines(), *notes], pieces=(table, *(Text(f"{note}.") for note in notes)))
 
@@ -176,7 +176,9 @@ def _named(camera: Camera, quantity: str) -> str:
 
 
 def number_row(name: str, value: float, unit: str, verdict: Verdict | None, undisputed: Verdict | None = None) -> _Row:
-    """A number; without a verdict it was held, or nothing was minimised. `undisputed`: without what is contradicted."""
+    """Row of a number; without a verdict it was held, or nothing was minimised. `undisputed`: the verdict without what
+    is contradicted.
+    """
     space = f" {unit}" if unit else ""
     if verdict is None:
         return name, f"{value:.10g}{space}", "", "", "", "not free"
@@ -189,7 +191,7 @@ def number_row(name: str, value: float, unit: str, verdict: Verdict | None, undi
 
 
 def _width(sd: float, unit: str, plain: bool) -> str:
-    """A standard deviation; `plain`: of a coefficient."""
+    """Format a standard deviation; `plain`: of a coefficient."""
     if unit == "m":
         return mm(1e3 * sd)
     if not np.isfinite(sd):
@@ -198,10 +200,10 @@ def _width(sd: float, unit: str, plain: bool) -> str:
 
 
 def bounds(verdict: Verdict, unit: str = "") -> str:
-    """What 95 % bounds leave, as finely as the value is given."""
+    """Format 95 % bounds with as many digits as the value."""
     if np.isfinite([verdict.low, verdict.high, verdict.sd]).all() and verdict.low != 0.0:
         low, high = (at_precision(bound, verdict.sd) for bound in (verdict.low, verdict.high))
-        if ("e" in low) != ("e" in high):  # as many places, without powers
+        if ("e" in low) != ("e" in high):  # the same number of decimals, without powers
             places = 1 - int(np.floor(np.log10(verdict.sd)))
             low, high = (f"{bound:.{places}f}" for bound in (verdict.low, verdict.high))
         return f"{low} to {high}{f' {unit}' if unit else ''}"
@@ -225,7 +227,7 @@ def _station(quality: Quality, name: str) -> Section:
 
 
 def _angles(quality: Quality, name: str, camera: Camera) -> Iterator[_Row]:
-    """The paper's angles and the tilt, with what turns about the camera's axes leave of them."""
+    """Yield the paper's angles and the tilt, with standard deviations from those of turns about the camera's axes."""
     every = (quality.verdicts.get(("station", name, f"turn_{axis}")) for axis in "xyz")
     turns = [verdict for verdict in every if verdict is not None]
     rotation = camera.cam_from_world.rotation
@@ -246,7 +248,9 @@ def _angles(quality: Quality, name: str, camera: Camera) -> Iterator[_Row]:
 
 
 def _angle_sds(rotation: Array, covariance: Array, sd: Array) -> Array:
-    """(4, n) degrees: of the angles, by the correlation of the three turns and each column of their sd (3, n) rad."""
+    """(4, n) degrees, standard deviations of the angles, given the correlation of the three turns and each column of
+    their sd (3, n) rad.
+    """
     turn = 1e-6  # rad
     own = np.sqrt(np.diagonal(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -255,13 +259,14 @@ def _angle_sds(rotation: Array, covariance: Array, sd: Array) -> Array:
         [(_angles_deg(rotation_exp(turn * axis) @ rotation) - _angles_deg(rotation)) / turn for axis in np.eye(3)], 1
     )
     slopes = (slopes + 180.0 / turn) % (360.0 / turn) - 180.0 / turn  # a turn past 180 degrees is a small one
-    with np.errstate(invalid="ignore"):  # of what is unknown; an angle that does not depend on it is unknown, too
+    # unknown turns give NaN; an angle that does not depend on one counts as unknown, too
+    with np.errstate(invalid="ignore"):
         spread = np.stack([np.einsum("ai,ij,aj->a", slopes * s, correlation, slopes * s) for s in sd.T], 1)
     return np.where(np.isfinite(spread), np.sqrt(np.maximum(spread, 0.0)), np.inf)
 
 
 def _angles_deg(rotation: Array) -> Array:
-    """(4,) alpha, beta, gamma and the tilt."""
+    """(4,) alpha, beta, gamma and the tilt, degrees."""
     tilt = np.arctan2(np.hypot(*rotation[2, :2]), -rotation[2, 2])
     return np.degrees([*euler_from_rotation(rotation), tilt])
 
@@ -278,7 +283,7 @@ def _dimensions(quality: Quality) -> Section:
 
 
 def _as_built(quality: Quality) -> Section:
-    """What is off its drawing, the farthest first."""
+    """Section on what is off its nominal position, the farthest first."""
     structure, as_built = quality.calibration.estimate.structure, quality.calibration.as_built
     order = np.argsort(-np.abs(structure.values[: structure.own]), kind="stable").tolist()
     rows = []

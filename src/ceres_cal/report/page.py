@@ -1,4 +1,4 @@
-"""The page and its pieces as HTML. Every text that comes in is escaped here, and only here."""
+"""HTML of the page and its pieces. All text is escaped here, and only here."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, to_svg
 
 @singledispatch
 def html(piece: Any) -> str:
-    """The element of a piece."""
+    """Return the element of a piece."""
     raise TypeError(f"no piece of a page: {piece!r}")
 
 
@@ -37,7 +37,7 @@ def _(piece: document.BulletList) -> str:
 
 @html.register
 def _(piece: document.Table) -> str:
-    short = 14  # letters that stay on one line
+    short = 14  # largest number of letters that stay on one line
 
     def of_row(row: Sequence[str]) -> str:
         cells = (
@@ -133,7 +133,7 @@ def _class(*names: str) -> str:
 def page(
     title: str, about: str, chapters: Sequence[document.Chapter], foot: str, kind: str = "Calibration report"
 ) -> str:
-    """The whole page, which needs nothing from elsewhere, and in which no script but its own runs."""
+    """Return the whole page, which is self-contained and runs no script but its own."""
     template, style, script = (
         files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8")
         for name in ("page.html", "style.css", "hover.js")

@@ -1,8 +1,8 @@
-"""How well a calibration is known, gathered once for the commands' answers and for the report.
+"""Quality of a calibration, gathered once for the commands' answers and for the report.
 
-By how much what is named as wrong with the model moves a result: places on the field, a camera's own numbers.
+Includes how far known faults of the model move a result: places on the field, a camera's own numbers.
 
-What a report is made of besides: seams, the closed form beside the bundle, projected paint.
+Also the further parts of a report: seams, the closed form beside the bundle adjustment, projected paint.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 def with_faults(
     known: Uncertainty, of: FieldMap, step: JointStep | None, faults: Sequence[Finding], doubtful_mm: float
 ) -> tuple[FieldMap, float]:
-    """A map whose radii have faults counted, and by how many standard deviations these move its places, root mean
-    squares over what is known: what a camera has besides displaces the image, and moves its numbers.
+    """Return a map whose radii include faults, and the root mean square number of standard deviations by which these
+    move its known places. A fault that is an effect of a camera displaces the image, and moves the camera's numbers.
     """
-    within = 2.0  # times its root mean square, how far what a fault leaves reaches
+    within = 2.0  # ratio of the limit of a remaining fault to its root mean square
     moved_mm = np.zeros(of.shape)
     if step is not None and step.causes:
         pixels = visible_pixels(known.estimate, of.station, of.places, of.height_m)
@@ -59,8 +59,8 @@ def _is_of_camera(fault: Finding) -> bool:
 
 
 def sigmas_of_cameras(known: Uncertainty, step: JointStep | None) -> float:
-    """By how many of its standard deviations the number of a camera that faults move farthest is moved; coefficients
-    are not looked at, which trade off against one another.
+    """Return the largest number of standard deviations by which faults move a number of a camera. Coefficients are
+    ignored, since they trade off against one another.
     """
     keys, sd = known.posterior.keys, known.posterior.sd
     own = np.array([key.kind == "camera" and key.quantity in OF_PIXELS for key in keys], dtype=bool)
@@ -70,7 +70,7 @@ def sigmas_of_cameras(known: Uncertainty, step: JointStep | None) -> float:
 
 
 def _steps(step: JointStep | None, keys: Sequence[Key]) -> Array:
-    """(K,) by how much some numbers move."""
+    """(K,) how far the joint step moves some numbers."""
     moves = {} if step is None else step.moves
     return np.array([moves.get(key, 0.0) for key in keys])
 
@@ -81,14 +81,14 @@ def _by_number(known: Uncertainty | None) -> dict[tuple[str, str, str], Verdict]
 
 
 Seam = tuple[tuple[str, str], tuple[FieldMap, ...], "Disagreement"]
-"""What two stations disagree about: who they are, predicted at HEIGHTS_M, and measured in what both observed."""
+"""Disagreement of two stations: their names, the prediction at HEIGHTS_M, and that measured in what both observed."""
 
 
 def quality_of(calibration: Calibration, observations: Observations) -> Quality:
-    """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised. Where
-    that fails, the verdict says so.
+    """Diagnose a calibration on its own observations, or on a sample if there are very many; not where nothing was
+    minimised. If the diagnosis fails, the verdict says so.
     """
-    diagnosed = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
+    diagnosed = 5_000  # number of observations for the answer of `calibrate`; `diagnose` and the report read all
     observations = calibration.as_taken(observations)
     if not calibration.rounds:
         return Quality(calibration, observations, None)
@@ -104,8 +104,8 @@ class Quality(Frozen):
     """A calibration, the observations beside it, and how well it is known.
 
     Attributes:
-        diagnosis: what the residuals say; None where they cannot be read, or nothing was minimised.
-        undiagnosed: why they cannot be read.
+        diagnosis: diagnosis of the residuals; None where it failed, or nothing was minimised.
+        undiagnosed: why it failed.
     """
 
     calibration: Calibration
@@ -115,47 +115,47 @@ class Quality(Frozen):
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """None where nothing was minimised."""
+        """Uncertainty of the calibration; None where nothing was minimised."""
         return None if self.calibration.posterior is None else self.calibration.uncertainty
 
     @cached_property
     def verdicts(self) -> dict[tuple[str, str, str], Verdict]:
-        """By kind, owner and quantity; what was held is not there."""
+        """Verdicts by kind, owner and quantity; numbers that were held have none."""
         return _by_number(self.uncertainty)
 
     @cached_property
     def undisputed(self) -> dict[tuple[str, str, str], Verdict]:
-        """The same without what was stated and is contradicted."""
+        """Verdicts without prior knowledge that is contradicted."""
         return _by_number(self.uncertainty and self.uncertainty.undisputed)
 
     @cached_property
     def fields(self) -> tuple[Target, ...]:
-        """Targets that lie in the world."""
+        """Targets in the world."""
         names = dict.fromkeys(view.target for view in self.observations.views if view.placement is None)
         return tuple(self.observations.targets[name] for name in names)
 
     @cached_property
     def placed(self) -> tuple[str, ...]:
-        """Stations that have a place over a field."""
+        """Stations that are posed over a field."""
         if not self.fields:
             return ()
         return tuple(name for name in self.calibration.stations if ("station", name, "height") in self.verdicts)
 
     @cached_property
     def maps(self) -> dict[str, tuple[FieldMap, ...]]:
-        """Of each placed station, at HEIGHTS_M."""
+        """Maps of each placed station, at HEIGHTS_M."""
         if self.uncertainty is None:
             return {}
         return {name: tuple(self.uncertainty.map_sd_mm(name, h) for h in HEIGHTS_M) for name in self.placed}
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Of the diagnosis."""
+        """Findings of the diagnosis."""
         return () if self.diagnosis is None else self.diagnosis.findings
 
     @cached_property
     def faults(self) -> tuple[Finding, ...]:
-        """What is wrong with the model, which no standard deviation contains."""
+        """Findings that the model is wrong, which no standard deviation includes."""
         return tuple(finding for finding in self.findings if finding.is_model_error)
 
     @property
@@ -164,7 +164,7 @@ class Quality(Frozen):
 
     @cached_property
     def faulty_maps(self) -> tuple[tuple[tuple[FieldMap, float], ...], ...]:
-        """The maps `with_faults`, of each placed station, at HEIGHTS_M."""
+        """Maps of each placed station `with_faults`, at HEIGHTS_M."""
         if self.uncertainty is None:
             return ()
         return tuple(
@@ -174,8 +174,8 @@ class Quality(Frozen):
 
     @property
     def doubtful_mm(self) -> float:
-        """By how much the feature of a field lies aside that was solved for farthest, where what is wrong with a camera
-        is as large as the noise: then it may lie as drawn, and the camera be wrong there by as much.
+        """Largest offset, mm, that was estimated for a feature of a field, if a camera's faults are as large as the
+        noise; else 0. The feature may then be in its nominal position, and the camera wrong there by this amount.
         """
         if sum(fault.noise_ratio**2 for fault in self.faults if _is_of_camera(fault)) < 1.0:
             return 0.0
@@ -185,7 +185,7 @@ class Quality(Frozen):
 
     @cached_property
     def fault_sigmas(self) -> float:
-        """By how many standard deviations faults move places on the fields, or, without any, a camera's numbers."""
+        """Standard deviations by which faults move places on the fields, or, without any fields, a camera's numbers."""
         if self.uncertainty is None:
             return 0.0
         if not self.faulty_maps:
@@ -194,8 +194,8 @@ class Quality(Frozen):
 
     @cached_property
     def observed_px(self) -> float:
-        """95 % of places in the picture are nearer, whatever the pose, at the worst place in the box around what was
-        observed; of the camera of which least is known, NaN where nothing was minimised.
+        """Radius, px, that contains 95 % of image positions, whatever the pose, at the worst place in the box around
+        what was observed, for the least known camera; NaN where nothing was minimised.
         """
         if self.uncertainty is None:
             return np.nan
@@ -203,7 +203,7 @@ class Quality(Frozen):
         return max(every, default=np.nan)
 
     def each_seam(self) -> Iterator[Seam]:
-        """Of stations of different cameras that see some place both."""
+        """Yield the seams of stations of different cameras that both see some place."""
         owners = self.calibration.estimate.stations
         for pair in combinations(self.placed, 2):
             if self.uncertainty is None or owners[pair[0]].camera == owners[pair[1]].camera:
@@ -214,7 +214,7 @@ class Quality(Frozen):
 
 
 def _of_observed(known: ImageMap, observations: Observations) -> float:
-    """The largest radius in the box around what a camera observed, px."""
+    """Largest radius in the box around a camera's observations, px."""
     views = np.array([view.camera == known.camera for view in observations.views])
     seen = [one.pixels[views[one.view]] for one in (observations.points, observations.curves)]
     pixels = np.concatenate(seen)
@@ -229,11 +229,11 @@ def _of_observed(known: ImageMap, observations: Observations) -> float:
 
 
 class FramePhotographs(Struct, frozen=True, eq=False):
-    """Photographs by the names of their frames and stations, and the calibration to compare with.
+    """Photographs by the names of their frames and stations, and a calibration to compare with.
 
     Attributes:
-        paths: frame, station -> image file. before: an earlier calibration, drawn in cyan; None for the closed form,
-            where there is one.
+        paths: frame, station -> image file.
+        before: an earlier calibration, drawn in cyan; None for the closed form, if there is one.
     """
 
     paths: Mapping[tuple[str, str], Path]
@@ -241,10 +241,10 @@ class FramePhotographs(Struct, frozen=True, eq=False):
 
 
 class Material(Quality):
-    """A calibration, observations, what the residuals between them say, and what was asked for besides.
+    """A calibration, observations, their diagnosis, and further inputs of a report.
 
     Attributes:
-        choices: camera -> that of its lens, by held-out error. photographs: into which the model is drawn.
+        choices: camera -> choice of its lens by held-out error. photographs: into which the model is drawn.
     """
 
     diagnosis: Diagnosis
@@ -253,17 +253,17 @@ class Material(Quality):
 
     @cached_property
     def placed(self) -> tuple[str, ...]:
-        """Stations that have a place over a field, of those that the observations name."""
+        """Stations that are posed over a field, among those that the observations name."""
         placed = super().placed
         return tuple(name for name in self.observations.stations if name in placed)
 
     @cached_property
     def drawn_maps(self) -> dict[str, tuple[FieldMap, ...]]:
-        """The same on the finer grid that is drawn; what is said in numbers is the maps' own, as everywhere."""
+        """Maps on a finer grid for drawing; stated numbers are always those of `maps`."""
         return {name: tuple(self._finer(one) for one in maps) for name, maps in self.maps.items()}
 
     def _finer(self, one: FieldMap) -> FieldMap:
-        finer = 2  # than the maps' own grid, where that is quick
+        finer = 2  # factor on the resolution of the maps' own grid, where that is fast
         uncertainty = self.calibration.uncertainty
         if self.observations.stations[one.station] in uncertainty.posterior.followed:  # each place takes long there
             return one
@@ -272,14 +272,14 @@ class Material(Quality):
 
     @cached_property
     def seams(self) -> tuple[Seam, ...]:
-        """At most six; none of new data, which say nothing of how well the others agree."""
+        """At most six seams; none for new data, which show nothing of how well the other cameras agree."""
         most_seams = 6
         return () if self.diagnosis.new_data else tuple(islice(self.each_seam(), most_seams))
 
     @cached_property
     def closed_form(self) -> tuple[Calibration, Array] | str:
-        """The answer of the paper's own method to the same observations, and the lengths (N,) px of the residuals that
-        it leaves of each, points first, NaN where it cannot show one; or why there is none.
+        """The calibration of the same observations by the paper's own method, and the lengths (N,) px of its residuals,
+        points first, NaN where it cannot show an observation; or the reason why there is none.
         """
         if self.diagnosis.new_data:
             return "these observations are others than those the calibration was made from"
@@ -301,7 +301,7 @@ class Material(Quality):
         return np.asarray(owners[self.diagnosis.table.view])
 
     def observed(self, station: str) -> Array:
-        """(N, 2) px: where observations of a station lie that took part, evenly thinned where they are many."""
+        """(N, 2) px of a station's inliers, evenly thinned if there are many."""
         most_dots = 2000  # observations drawn into one map
         table = self.diagnosis.table
         seen = np.array([view["station"] == station for view in table.views])
@@ -310,14 +310,14 @@ class Material(Quality):
 
 
 def paint_of(targets: Iterable[Target]) -> Iterator[Array]:
-    """Each curve of targets that lie in the world as a polyline (S, 3) m."""
+    """Yield each curve of targets in the world as a polyline (S, 3) m."""
     curve_pieces = 95
     for target in targets:
         yield from (curve_points(curve, 0, curve_pieces) for curve in target.curves.values())
 
 
 def image_border(camera: Camera, height_m: float) -> Array:
-    """(B, 2) m: the border of a posed camera's image on a plane, NaN where it does not meet that."""
+    """(B, 2) m, the border of a posed camera's image on a plane; NaN where a ray does not meet it."""
     border_steps = 60
     width, height = camera.image_size
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5

@@ -1,4 +1,4 @@
-"""The report: chapters in the order in which they are read, as one page that needs nothing from elsewhere."""
+"""The report: chapters in reading order, as one self-contained page."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from ceres_cal.report.residual_pictures import against_radius, by_frame, outlier
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation, distortion
 from ceres_cal.report.summary import numbers_chapter, verdict_chapter
 
-_CHAPTERS = 8  # at most
+_CHAPTERS = 8  # largest number of chapters
 MOST_CAMERAS = 8
-"""Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
+"""Largest number of cameras, and of stations, with pictures of their own; the others are only in the tables."""
 
 _OF_MAPS = (
     "How far off a located point may be because of the calibration: 95 % are within the mm shown. Blue is good, amber "
@@ -40,13 +40,14 @@ def make_report(
     photographs: FramePhotographs | None = None,
     progress: StepProgress | None = None,
 ) -> str:
-    """One self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
+    """Return one self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
 
     Args:
-        observations: those it was made from; or others, with a diagnosis of them (`new_data`).
-        diagnosis: of these observations; made here where there is none. choices: camera -> that of its lens,
-            by held-out error.
-        photographs: of the frames, for a chapter with the model drawn into them. progress: called after each chapter.
+        observations: those the calibration was made from; or others, with a diagnosis of them (`new_data`).
+        diagnosis: of these observations; computed here if it is None.
+        choices: camera -> choice of its lens by held-out error.
+        photographs: of the frames, for a chapter with the model drawn into them.
+        progress: called after each chapter.
 
     Raises:
         InputError: the observations are not those of the calibration, and no diagnosis says so; or a photograph cannot
@@ -71,7 +72,7 @@ def write_report(
     choices: Mapping[str, LensChoice] | None = None,
     photographs: FramePhotographs | None = None,
 ) -> None:
-    """Write `make_report`'s page.
+    """Write the page of `make_report`.
 
     Raises:
         InputError: see `make_report`; or the file cannot be written.
@@ -82,7 +83,7 @@ def write_report(
 def _chapters(material: Material) -> Iterator[Chapter]:
     yield verdict_chapter(material)
     if material.photographs is not None:
-        from ceres_cal.report.in_photographs import in_photographs  # OpenCV, for photographs alone
+        from ceres_cal.report.in_photographs import in_photographs  # imports OpenCV, only for photographs
 
         yield in_photographs(material, material.photographs)
     supported = tuple(support(material, name) for name in list(material.observations.cameras)[:MOST_CAMERAS])
@@ -107,7 +108,9 @@ def _pictures(material: Material) -> Iterator[Chapter]:
 
 
 def _places(material: Material) -> Iterator[Piece]:
-    """Maps over the image beside those over the field; of cameras without a place over one, over the image alone."""
+    """Yield maps over the image beside those over the field; for cameras without a place over a field, over the image
+    alone.
+    """
     if material.uncertainty is None:
         return
     stations = list(material.maps)

@@ -1,6 +1,6 @@
-"""Pictures of the residuals: over the image, against the radius, by frame; and what was taken out, by feature.
+"""Pictures of the residuals: over the image, against the radius, by frame; and of the outliers, by feature.
 
-And what was observed: which parts of a camera's image, and which stretches of the field's lines.
+Also of what was observed: parts of a camera's image, and stretches of the field's lines.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _MOST_FRAMES_NAMED, _MOST_BARS = 24, 12
 
 
 def stride(material: Material, count: int) -> int:
-    """Every how manieth of so many rows is drawn, so that they are few enough for the page."""
-    most_drawn = 5000  # strokes of one page, shared among its cameras
+    """Return the step between the rows that are drawn, so that there are few enough for the page."""
+    most_drawn = 5000  # largest number of strokes in a page, shared by its cameras
     most = max(most_drawn // len(material.observations.cameras), 200)
     return max(-(-count // most), 1)
 
@@ -45,7 +45,7 @@ def _thinned(drawn: int, of: int) -> str:
 
 
 def vectors(material: Material, name: str) -> Figure:
-    """Residual vectors over one camera's image."""
+    """Make the figure of residual vectors over one camera's image."""
     table, size = material.diagnosis.table, material.calibration.cameras[name].image_size
     own = material.of_camera(name)
     inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & table.outlier)
@@ -72,9 +72,9 @@ def vectors(material: Material, name: str) -> Figure:
 
 
 def _enlarged(table: ResidualTable, inliers: Indices, size: tuple[int, int]) -> int:
-    """How many times strokes are enlarged, a round number."""
+    """Return the enlargement of the strokes, a round number."""
     enlarged = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-    typical = 0.015  # of the image's width: what the median is enlarged to
+    typical = 0.015  # drawn length of the median residual, as a share of the image's width
     wanted = typical * size[0] / max(_typical_px(table, inliers), 1e-12)
     return max((e for e in enlarged if e <= wanted), default=1)
 
@@ -92,7 +92,7 @@ def draw_vectors(
     means: tuple[Array, Array, int],
     paint: Sequence[Array] = (),
 ) -> None:
-    """Paint (S, 2) px each, vectors of points and of curves, means of regions, and outliers.
+    """Draw paint (each (S, 2) px), vectors of points and of curves, means of regions, and outliers.
 
     Args:
         rows: of the table, inliers and outliers. means: see `significant_means`.
@@ -114,7 +114,7 @@ def draw_vectors(
         canvas.crosses(axes, table.pixel[outliers], OUTLIER, 0.012 * size[0])
         axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
     typical = _typical_px(table, inliers)
-    start = np.array([[0.03 * size[0], 0.95 * size[1]]])  # a stroke as long as the median residual
+    start = np.array([[0.03 * size[0], 0.95 * size[1]]])  # a stroke of the length of the median residual
     end = start + np.array([enlarged * typical, 0.0])
     canvas.strokes(axes, start, end, INK, 1.5)
     text = axes.text(end[0, 0] + 0.012 * size[0], start[0, 1], f"median {short(typical)} px", va="center", fontsize=7.0)
@@ -123,7 +123,7 @@ def draw_vectors(
 
 
 def plot_residuals(diagnosis: Diagnosis, axes: Axes, camera: str | None) -> None:
-    """Residual vectors over one camera's image, as large as what was observed there, in somebody's own axes.
+    """Draw residual vectors over one camera's image, as large as what was observed there, into the user's own axes.
 
     Raises:
         InputError: no such camera, or none named where there are several.
@@ -143,23 +143,24 @@ def plot_residuals(diagnosis: Diagnosis, axes: Axes, camera: str | None) -> None
 
 
 def owner_suffix(material: Material, camera: str) -> str:
-    """The camera's name behind a title, where there are several."""
+    """The camera's name for the end of a title, if there are several cameras; else ""."""
     return f", {camera}" if len(material.observations.cameras) > 1 else ""
 
 
 def number_of(material: Material, camera: str) -> int:
-    """The camera's place among all."""
+    """Index of the camera among all."""
     return list(material.observations.cameras).index(camera)
 
 
 def significant_means(table: ResidualTable, rows: Indices, size: tuple[int, int]) -> tuple[Array, Array, int]:
-    """Mean displacements (C, 2) px that noise does not explain, of regions of an image: their places (C, 2) px, the
-    displacements, and how many regions had enough rows.
+    """Mean displacements in regions of an image that noise does not explain: places (C, 2) px, displacements (C, 2) px,
+    and the number of regions with enough rows.
 
-    A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
+    A point determines both coordinates, a curve the one across it: least squares over the region, weighted by their
+    sigmas.
     """
-    not_noise = 13.8  # squared length of a mean in its sigmas that noise reaches once in a thousand
-    fewest = 4  # observations of a cell
+    not_noise = 13.8  # squared length of a mean in sigmas that noise exceeds once in a thousand
+    fewest = 4  # least number of observations in a cell
     mean_grid = 16  # cells along the image's longer side
     width, height = size
     cell = max(width, height) / mean_grid
@@ -184,7 +185,7 @@ def significant_means(table: ResidualTable, rows: Indices, size: tuple[int, int]
 
 
 def lines_in_image(material: Material, camera: str) -> dict[str, Array]:
-    """The field's curves, "target/name", as the camera's first placed station sees them, (S, 2) px; NaN outside."""
+    """The field's curves, by "target/name", as the camera's first placed station sees them, (S, 2) px; NaN outside."""
     stations = [s for s, owner in material.observations.stations.items() if owner == camera]
     seen = [v.station for v in material.observations.views if v.placement is None and v.station in stations]
     if not seen:
@@ -200,7 +201,7 @@ def lines_in_image(material: Material, camera: str) -> dict[str, Array]:
 
 
 def frame_image(axes: Axes, size: tuple[int, int]) -> None:
-    """The axes as an image of so many pixels."""
+    """Set the axes to an image of this size in pixels."""
     axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal", xlabel="px")
     axes.grid(visible=False)
     for side in axes.spines.values():
@@ -217,8 +218,9 @@ def _region_table(summary: Summary, camera: str) -> Table:
 
 
 def against_radius(material: Material, name: str) -> Figure:
-    """Residuals away from the principal point against the radius, with their trend."""
-    vague = 0.3  # of the residuals' reach: a ring's mean that is less sure than that is in the table alone
+    """Make the figure of residuals away from the principal point against the radius, with their trend."""
+    # limit of the sd of a ring's mean, as a share of the residuals' range; less certain means are only in the table
+    vague = 0.3
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     trend = next(trend for trend in material.diagnosis.summaries.trends if trend.camera == name)
     radius, outward = _outward(table, np.flatnonzero(material.of_camera(name) & table.inlier), camera)
@@ -226,7 +228,7 @@ def against_radius(material: Material, name: str) -> Figure:
     drawn = known[:: stride(material, len(known))]
     middle = 0.5 * (trend.radius_px[1:] + trend.radius_px[:-1])
     spread = float(np.quantile(np.abs(outward[known]), 0.995)) if len(known) else 1.0
-    mean_px = np.where(trend.sd_px < vague * spread, trend.outward_px, np.nan)  # else it hides the others
+    mean_px = np.where(trend.sd_px < vague * spread, trend.outward_px, np.nan)  # otherwise it would hide the others
     reach = 1.15 * max(spread, float(np.nanmax(np.abs(mean_px), initial=0.0)), 1e-9)
 
     def draw(axes: Axes, width_in: float) -> None:
@@ -257,7 +259,7 @@ def _trend_rows(trend: RadiusTrend) -> Iterator[tuple[str, ...]]:
 
 
 def _outward(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array, Array]:
-    """Radius and outward residual of some rows, px; NaN of a curve that runs outwards, and so tells nothing of it."""
+    """Radius and outward residual of some rows, px; NaN for a curve that runs outwards, which does not determine it."""
     offsets, residual = camera.offsets(table.pixel[rows]), table.residual_px[rows]
     radius = np.asarray(np.linalg.norm(offsets, axis=1))
     outward = np.sum(residual * offsets, axis=1) / np.maximum(radius, 1e-9)
@@ -272,7 +274,7 @@ def _outward(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array
 
 
 def by_frame(material: Material) -> Figure:
-    """Root mean square residual of each frame, in standard deviations."""
+    """Make the figure of each frame's root mean square residual, in standard deviations."""
     frames = material.diagnosis.summaries.frames
     number = np.arange(len(frames.names), dtype=float)
     few = len(number) <= _MOST_FRAMES_NAMED
@@ -313,7 +315,7 @@ def _clipped(name: str) -> str:
 
 
 def outliers(material: Material) -> Figure | None:
-    """Which features were taken out, how often; None where nothing was."""
+    """Make the figure of how many outliers each feature has; None if there are none."""
     table = material.diagnosis.table
     rows = np.flatnonzero(table.outlier)
     if not len(rows):
@@ -367,12 +369,12 @@ def outliers(material: Material) -> Figure | None:
 # ---- what was observed ----------------------------------------------------------------------------------------------
 
 
-_NEAR = 0.06  # of the image's width: a stretch of a line is supported where an observation of it lies as near
+_NEAR = 0.06  # share of the image's width within which an observation supports a stretch of its line
 _FILLED, _EMPTY = "#d9e8f3", "#fcede4"
 
 
 def support(material: Material, name: str) -> Figure:
-    """The picture of one camera."""
+    """Make the figure of what one camera observed."""
     table, size = material.diagnosis.table, material.calibration.cameras[name].image_size
     own = material.of_camera(name) & table.inlier
     counts, ends = counts_of_parts(table.pixel[own], size)
@@ -421,7 +423,7 @@ def support(material: Material, name: str) -> Figure:
 
 
 def counts_of_parts(pixels: Array, size: tuple[int, int]) -> tuple[Array, tuple[Array, Array]]:
-    """How many observations (Y, X) lie in each part of an image, and the parts' ends."""
+    """Number of observations (Y, X) in each part of an image, and the parts' limits, px."""
     cells = 16  # along the longer side of the image
     cell = max(size) / cells
     ends = [np.linspace(-0.5, side - 0.5, round(side / cell) + 1) for side in size]

@@ -1,6 +1,6 @@
-"""The scales of colour, the same in every report: blue is good, amber wants care, brown is not to be used.
+"""Colour scales, the same in every report: blue is good, amber is usable with limits, brown is not to be used.
 
-Lightness falls all the way, so that grey print and colour-blind readers have the same order.
+Lightness decreases monotonically, so that the order is visible in grey print and to colour-blind readers.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 COLORS = ("#eef5fa", "#d9e8f3", "#bfd8ea", "#a3c6e0", "#86b2d4", "#6a9dc7", "#4f88b8", "#a05c08", "#7e3f06", "#5e1c0a")
 _ON_LIGHT, _ON_DARK = "#26303a", "#eef5fb"
-"""What is drawn upon them, in a dark window too."""
+"""Colours of what is drawn on top, in a dark window, too."""
 _UNKNOWN = "#fcede4"
 
 
 class Scale(Struct, frozen=True):
-    """Where one colour of `COLORS` ends and the next begins, in a unit."""
+    """Limits between the colours of `COLORS`, in a unit."""
 
     borders: tuple[float, ...]
     unit: str
 
     def fill(self, axes: Axes, x: Array, y: Array, values: Array) -> None:
-        """Values (Y, X) over a grid: NaN stays open, infinity is hatched."""
+        """Draw values (Y, X) over a grid: NaN is left open, infinity is hatched."""
         endless = 1e300
         unknown = np.isinf(values)
         if unknown.any():
@@ -40,13 +40,13 @@ class Scale(Struct, frozen=True):
             axes.contourf(x, y, known, [0.0, *self.borders, endless], colors=COLORS)
 
     def ink(self, values: Array | float) -> str:
-        """The colour of what is drawn where values are about these."""
-        dark = 7  # of the colours, from which on
+        """Return the colour of what is drawn on top of these values."""
+        dark = 7  # index of the first dark colour
         known = np.ravel(values)[np.isfinite(np.ravel(values))]
         return _ON_DARK if len(known) and np.median(known) > self.borders[dark - 1] else _ON_LIGHT
 
     def bar(self, axes: Axes, label: str) -> None:
-        """The whole scale beneath the axes, whatever of it the picture needs."""
+        """Draw the whole scale beneath the axes, independent of the picture's values."""
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import BoundaryNorm, ListedColormap
 
@@ -67,9 +67,9 @@ class Scale(Struct, frozen=True):
 
 MM = Scale((0.1, 0.2, 0.5, 1.0, 2.0, 5.0, GOOD_MM, 20.0, CARE_MM), "mm")
 PX = Scale((0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), "px")
-"""Of what a lens shows, of which no verdict speaks: amber is more than a detected corner or line is off by."""
+"""Scale for lenses, to which no verdict applies: amber is more than the error of a detected corner or line."""
 
 
 def spoken(values: Sequence[float] | Array) -> tuple[str, ...]:
-    """Each value with two digits: "" of NaN, "unknown" of infinity."""
+    """Format each value with two digits; "" for NaN, "unknown" for infinity."""
     return tuple("" if np.isnan(value) else short(float(value)) for value in np.ravel(values))

@@ -1,4 +1,4 @@
-"""Pictures of the solve: correlation of the numbers, convergence, closed form against bundle; and of the lens."""
+"""Pictures of the solve (correlations, convergence, closed form against bundle adjustment) and of the lens."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _STEPS, _TABLE_STEPS = 120, 10
 
 
 def correlation(material: Material) -> Figure | None:
-    """Correlation of the shared numbers, cameras and stations first; None where there is no covariance."""
-    most_numbers = 24  # of a correlation picture
+    """Make the figure of correlations between shared numbers, cameras and stations first; None without a covariance."""
+    most_numbers = 24  # largest number of rows in the picture
     posterior = material.calibration.posterior
     if posterior is None:
         return None
@@ -79,7 +79,7 @@ def _draw_matrix(axes: Axes, matrix: Array, labels: Sequence[str]) -> None:
 
 
 def label(key: Key, others: Sequence[Key]) -> str:
-    """A number's name, with its owner where several have one of that name."""
+    """Name of a number, with its owner where several owners have a number of that name."""
     same = {other.owner for other in others if (other.kind, other.quantity) == (key.kind, key.quantity)}
     name = key.quantity.replace("_", " ")
     whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure", "dimension") else name
@@ -101,7 +101,9 @@ def _pairs(matrix: Array, labels: Sequence[str]) -> Table:
 
 
 def convergence(material: Material) -> Figure | None:
-    """The cost above its least, iteration by iteration of the last solve; None where nothing was minimised."""
+    """Make the figure of the cost above its minimum for each iteration of the last solve; None if nothing was
+    minimised.
+    """
     history = np.array(material.calibration.history)
     if len(history) < 2:
         return None
@@ -137,7 +139,7 @@ def convergence(material: Material) -> Figure | None:
 
 
 def against_closed_form(material: Material, closed: Calibration, left_px: Array) -> Figure:
-    """How many residuals are below a length, by the paper's closed form and by the bundle."""
+    """Make the figure of the distribution of residuals under the paper's closed form and the bundle adjustment."""
     table = material.diagnosis.table
     inlier = table.inlier
     lengths = {"closed form": left_px[inlier], "bundle": np.abs(table.distance_px[inlier])}
@@ -184,11 +186,11 @@ def _comparison(bundle: Calibration, closed: Calibration, curves: dict[str, Arra
 
 
 def ideal_radii(camera: Camera, radii: Array) -> Array:
-    """r' in px of measured radii r, along the image's x axis: phi times the tangent of the angle to the axis.
+    """r' in px for measured radii r, along the image's x axis: phi times the tangent of the angle to the axis.
 
     NaN past the lens's monotone radius, and from 90 degrees on.
     """
-    widest = 2.5  # r' over r: what lies beyond is nearly at a right angle to the axis
+    widest = 2.5  # largest r' over r: beyond it the ray is nearly at a right angle to the axis
     rays = camera.lens.undistort(np.column_stack([radii, 0.0 * radii]), camera.phi)
     with np.errstate(divide="ignore", invalid="ignore"):
         ideal = camera.phi * np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2]
@@ -196,7 +198,7 @@ def ideal_radii(camera: Camera, radii: Array) -> Array:
 
 
 def plot_distortion(camera: Camera, axes: Axes, reach: float = np.inf) -> None:
-    """r' against r of a camera, px, also in somebody's own axes; dotted beyond the reach of observations."""
+    """Draw r' against r of a camera, px, also into the user's own axes; dotted beyond the reach of observations."""
     radii = np.linspace(0.0, camera.corner_radius, _STEPS)
     ideal, known = ideal_radii(camera, radii), radii <= reach
     axes.plot(radii, radii, color=QUIET, linewidth=0.9, dashes=(4, 3), label="no distortion")
@@ -209,7 +211,7 @@ def plot_distortion(camera: Camera, axes: Axes, reach: float = np.inf) -> None:
 
 
 def distortion(material: Material, name: str) -> Figure:
-    """r' against r of one camera, and how far observations reach."""
+    """Make the figure of r' against r of one camera, with the extent of its observations."""
     camera, table = material.calibration.cameras[name], material.diagnosis.table
     seen = table.radius_px[material.of_camera(name) & table.inlier]
     reach = float(seen.max()) if len(seen) else 0.0

@@ -1,6 +1,6 @@
-"""What a calibration says of itself: its verdict, beside its numbers and how well each is known.
+"""Summary of a calibration: its verdict, its numbers and how well each is known.
 
-And the same as plain data, for a page that draws it itself: verdict, numbers, maps, advice.
+Also the same as plain data, for a page that draws it itself: verdict, numbers, maps, advice.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MEANING = (
 
 
 def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Section]:
-    """The answer of `calibrate` and `refit`; `inputs`: the files of observations."""
+    """Yield the answer of `calibrate` and `refit`; `inputs`: the files of observations."""
     calibration, observations = quality.calibration, quality.observations
     read = {"inputs": list(inputs), "counts": observations.counts, "calibration": calibration.to_file()}
     yield Section("read", [", ".join(map(str, inputs)), *observed(observations)], read)
@@ -48,7 +48,7 @@ def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Se
 
 
 def _verdict(quality: Quality) -> Section:
-    """The headline of the report, and what stands behind it and was not said yet."""
+    """Section with the headline of the report and its causes that were not stated before."""
     data, findings = _judged(quality), quality.findings
     cause = grounds.disputed(quality)
     named = [one for one in findings if grounds.is_against(one) and not cause][:_MOST_FINDINGS]
@@ -69,12 +69,12 @@ def _judged(quality: Quality) -> dict[str, Any]:
 
 
 def accuracy_sections(quality: Quality, seams: Sequence[Seam]) -> Iterator[Section]:
-    """How well cameras and places are known; `seams`: those that are said."""
+    """Yield how well cameras and places are known; `seams`: those that are stated."""
     uncertainty, maps = quality.uncertainty, quality.maps
     if uncertainty is None:
         yield Section(data={"uncertainty": None})
         return
-    pairs, most_pairs = uncertainty.rig, 6  # of four cameras all
+    pairs, most_pairs = uncertainty.rig, 6  # all pairs of four cameras
     more = [f"{plural(len(pairs) - most_pairs, 'more pair')} in --json"] if len(pairs) > most_pairs else []
     yield Section("rig", [*map(_rig_line, pairs[:most_pairs]), *more])
     yield Section("located", [f"{name}: {_sd_at_heights(every)}" for name, every in maps.items()])
@@ -116,7 +116,7 @@ def _map_data(m: FieldMap) -> dict[str, Any]:
 
 
 def _seams(seams: Sequence[Seam]) -> Section:
-    """By how much two cameras disagree about what both see."""
+    """Section on how much two cameras disagree where they overlap."""
     data, rows = [], []
     for stations, maps, measured in seams:
         rms, expected, count = measured.rms_mm, measured.expected_rms_mm, len(measured.what)
@@ -132,7 +132,7 @@ def _seams(seams: Sequence[Seam]) -> Section:
 
 
 def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
-    """What the observations hardly tell."""
+    """Yield what the observations hardly determine."""
     weak = uncertainty.weak_directions
     lines = [one.words for one in weak[:_MOST_DIRECTIONS]]
     if len(weak) > _MOST_DIRECTIONS:
@@ -155,10 +155,10 @@ def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
 
 
 def verdict_chapter(material: Material) -> Chapter:
-    """The chapter, its level the colour of the page's first box."""
+    """Make the chapter of the verdict; its level is the colour of the page's first box."""
     judged = grounds.judge_quality(material)
     tiles = tuple(_tiles(material))
-    if not grounds.promises(material):  # the verdict's colour, not that of a number nobody vouches for
+    if not grounds.promises(material):  # the verdict's colour instead of that of a number without a promise
         tiles = tuple(
             replace(tile, level=grounds.worst(judged.level, tile.level)) if tile.level else tile for tile in tiles
         )
@@ -212,7 +212,7 @@ def _focal_tile(verdict: Verdict) -> Tile:
 
 
 def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
-    """The numbers on a page."""
+    """Make the chapter of the numbers."""
     intro = (
         "Coefficients use the paper's notation with a1 = 1. Known: to 1 % or better. Weak: to 30 %. In conflict: all "
         "other observations contradict the stated value."
@@ -225,7 +225,7 @@ def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
 
 
 def known_of(quality: Quality) -> dict[str, Any]:
-    """Verdict, numbers, maps, and residuals by frame."""
+    """Return verdict, numbers, maps, and residuals by frame."""
     maps = next(iter(quality.maps.values()), ())
     return {
         **_judged(quality),
@@ -237,7 +237,7 @@ def known_of(quality: Quality) -> dict[str, Any]:
 
 
 def _numbers(quality: Quality) -> Iterator[dict[str, str]]:
-    """phi and height, and dimensions that were solved for."""
+    """Yield phi and height, and estimated dimensions."""
     for (kind, owner, quantity), verdict in quality.verdicts.items():
         if kind == "dimension" or quantity == "phi" or (kind == "station" and quantity == "height"):
             name = quantity.removesuffix("_m").replace("_", " ") if kind == "dimension" else f"{quantity} of {owner}"
@@ -247,14 +247,14 @@ def _numbers(quality: Quality) -> Iterator[dict[str, str]]:
 
 
 def _map(one: FieldMap) -> dict[str, Any]:
-    """Radii row by row, mm: None where nothing is seen, -1 where it is unknown."""
+    """Radii row by row, mm: None where nothing is seen, -1 where the radius is unknown."""
     values = np.where(np.isinf(one.radius_95_mm), -1.0, np.round(one.radius_95_mm, 3))
     ends = [float(one.x_m[0]), float(one.x_m[-1]), float(one.y_m[0]), float(one.y_m[-1])]
     return {"height_mm": round(1e3 * one.height_m), "ends": ends, "rows": values.tolist()}
 
 
 def strokes_of(table: ResidualTable) -> dict[str, list[list[Any]]]:
-    """By frame: x, y, by how much the model is beside it, px each, and whether it was taken out."""
+    """By frame: x, y, residual in x and y (px), and whether the observation is an outlier."""
     frames: dict[str, list[list[Any]]] = {}
     for number in np.flatnonzero(np.isfinite(table.residual_px[:, 0])).tolist():
         x, y = table.pixel[number].round(2).tolist()
@@ -268,8 +268,10 @@ def strokes_of(table: ResidualTable) -> dict[str, list[list[Any]]]:
 
 
 def advice_of(calibration: Calibration) -> list[dict[str, Any]]:
-    """The best measurement, and the next: what to do, what it leaves, and where in the picture that is."""
-    from ceres_cal.diagnostics.advice import advise  # and OpenCV, for the page of `open` alone
+    """Return the best measurement and the next one: what to do, the remaining uncertainty, and where it is in the
+    picture.
+    """
+    from ceres_cal.diagnostics.advice import advise  # imports OpenCV, only for the page of `open`
     from ceres_cal.report.pictures.overlay import places_in_picture
 
     advice, _ = answer_or_reason(lambda: advise(calibration))

@@ -1,6 +1,4 @@
-"""Targets as pictures: as drawn, with names; and to print, at their true size as a PDF with a ruler to check the
-printer by.
-"""
+"""Pictures of targets: drawings with names, and sheets to print at true size, PDF with a ruler to check the printer."""
 
 from __future__ import annotations
 
@@ -24,15 +22,15 @@ if TYPE_CHECKING:
 
 _PIECES = 60
 _STYLE = {
-    "margin": 0.04,  # of the target's size
-    "away": 0.006,  # of its width: names from what they name
-    "short": 15.0,  # of that distance: a curve whose name would be longer than it
-    "letters": 4.2,  # points
+    "margin": 0.04,  # margin, as a share of the target's size
+    "away": 0.006,  # distance of a name from its feature, as a share of the width
+    "short": 15.0,  # least length of a curve that is named, in units of that distance
+    "letters": 4.2,  # font size in points
 }
 
 
 def target_svg(target: Target, name: str) -> str:
-    """A file (.svg) of a target seen from above, x to the right, in metres; points that only crossings name are dots.
+    """Return an SVG file of a target seen from above, x to the right, in metres; unnamed crossings are dots.
 
     Raises:
         InputError: the target has no curves, and so nothing to draw.
@@ -67,7 +65,7 @@ def _draw_curves(axes: Axes, target: Target, away: float) -> None:
 
 
 def _beside(curve: Curve, away: float) -> Array:
-    """x and y of a place beside a curve's middle, and degrees by which letters there are turned."""
+    """x and y of a place beside a curve's middle, and the angle of text there in degrees."""
     before, there, after = curve_points(curve, 1, _PIECES)[[_PIECES // 3 - 1, _PIECES // 3, _PIECES // 3 + 1], :2]
     along = (after - before) / np.linalg.norm(after - before)
     turn = (np.degrees(np.arctan2(along[1], along[0])) + 90.0) % 180.0 - 90.0
@@ -89,7 +87,7 @@ _MARGIN_M, _FOOT_M = 0.008, 0.022
 
 
 def sheet_pdf(target: Target, title: str) -> bytes:
-    """The sheet as a PDF page of its own size: the target, below it a ruler and what it is.
+    """Return the sheet as a PDF page of its own size: the target, a ruler below it, and a title.
 
     Raises:
         InputError: the target is not printed on paper, or is too large for one page.
@@ -103,7 +101,7 @@ def sheet_pdf(target: Target, title: str) -> bytes:
 
 def _page(paper: Paper, title: str) -> Figure:
     inch_m = 0.0254
-    most_m = 14400 / 72.0 * inch_m  # of a page, by PDF's own limit
+    most_m = 14400 / 72.0 * inch_m  # largest page, a limit of PDF
     from matplotlib.figure import Figure
 
     low, high = np.array(paper.low_m), np.array(paper.high_m)
@@ -113,7 +111,7 @@ def _page(paper: Paper, title: str) -> Figure:
         raise InputError(f"a sheet of {width:.2f} x {height:.2f} m is too large for one page, at most {most_m:.2f} m")
     figure = Figure(figsize=tuple(page / inch_m))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, page[0]), ylim=(0.0, page[1]))  # metres from the bottom left
+    axes.set(xlim=(0.0, page[0]), ylim=(0.0, page[1]))  # in metres from the bottom left
     axes.set_axis_off()
     for patch in _patches(paper):
         axes.add_patch(patch)
@@ -122,8 +120,8 @@ def _page(paper: Paper, title: str) -> Figure:
 
 
 def _patches(paper: Paper) -> Iterator[PathPatch]:
-    """The shapes of one colour after another as one path, x to the right and y down, as the target's own axes are seen
-    from the front.
+    """Yield consecutive shapes of one colour as one path, x to the right and y down, as the target's axes are seen from
+    the front.
     """
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
@@ -139,7 +137,7 @@ def _patches(paper: Paper) -> Iterator[PathPatch]:
 
 
 def _draw_ruler(axes: Axes, width_m: float, title: str) -> None:
-    """A ruler of as many centimetres as fit, at most ten, and what to do with it."""
+    """Draw a ruler of as many centimetres as fit, at most ten, and how to use it."""
     count = int(min(10, (width_m - 2.0 * _MARGIN_M) / 0.01))
     left, base = _MARGIN_M, _FOOT_M - 0.006
     axes.plot([left, left + 0.01 * count], [base, base], color="black", linewidth=0.5)

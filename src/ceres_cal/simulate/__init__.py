@@ -1,6 +1,6 @@
-"""Simulation of scenes: observations with noise, outliers and hidden stretches, and their truth.
+"""Simulation of scenes: observations with noise, outliers and hidden stretches, and their true values.
 
-A scene may also say how photographs of it look, for scripts/rendering, which draws them.
+A scene may also describe how photographs of it look, for scripts/rendering, which draws them.
 """
 
 from ceres_cal.base.frozen import names_of

@@ -1,4 +1,4 @@
-"""How a board is held before a camera, and whether the camera shows it whole."""
+"""Poses of boards before a camera, and whether the camera shows them whole."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from ceres_cal.scene import Camera, Target
 
 
 def board_pose(board: Target, line_of_sight: Array, distance_m: float, turn_rad: tuple[float, float, float]) -> Pose:
-    """cam_from_board with the board's middle along a line of sight (3,) of length 1, so far from the camera.
+    """Return cam_from_board with the board's middle on a line of sight (3,) of length 1, at a distance from the camera.
 
-    Its normal points away from the camera, so that columns run right and rows down before it is turned: by spin about
-    its own normal, then by the tilt about an axis across the line of sight. That tilt brings its upper edge nearer to
-    the camera at direction 0, its right one at a quarter turn.
+    Its normal points away from the camera, so that columns run right and rows down. The board is then turned: by the
+    spin about its own normal, then by the tilt about an axis across the line of sight. The tilt brings its upper edge
+    nearer to the camera at direction 0, its right edge at a quarter turn.
 
     Args:
         turn_rad: tilt, direction of the tilt, spin.
@@ -29,7 +29,7 @@ def board_pose(board: Target, line_of_sight: Array, distance_m: float, turn_rad:
 
 
 def well_inside(camera: Camera, points_world: Array) -> Mask:
-    """(N,) whether points (N, 3) are before the camera, so far inside the image that noise keeps them there."""
+    """(N,) whether points (N, 3) are in front of the camera, and so far inside the image that noise moves none out."""
     margin_px = 5.0  # a board stays this far inside the image, so that noise moves no corner out
     pixels = camera.project(points_world)
     with np.errstate(invalid="ignore"):

@@ -1,5 +1,5 @@
-"""The scenes that come with the package, files in `scenes/`: by name for `ceres-cal simulate`, and the source of the
-sample data.
+"""The scenes in the package, files in `scenes/`: `ceres-cal simulate` takes them by name, and the sample data are made
+from them.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _SCENES = {
 
 
 def scene_names() -> dict[str, str]:
-    """The built-in scenes, each with a line that says what it is."""
+    """Return the built-in scenes, each with a line of description."""
     return dict(_SCENES)
 
 
 def built_in_scene(name: str) -> tuple[Scene, Disturbance]:
-    """A built-in scene and its disturbance.
+    """Return a built-in scene and its disturbance.
 
     Raises:
         InputError: there is none of this name.

@@ -1,4 +1,4 @@
-"""Scenes and truths as files: people write a scene, the truth lies beside the simulated observations."""
+"""Files of scenes and true values: users write scenes; the truth is saved beside the simulated observations."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def load_scene(path: str | Path) -> tuple[Scene, Disturbance]:
-    """A scene file and the disturbance in it.
+    """Load a scene file and the disturbance in it.
 
     Raises:
         InputError: one line that names the file and the place in it.
@@ -63,15 +63,15 @@ def load_scene(path: str | Path) -> tuple[Scene, Disturbance]:
 
 
 def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturbance]:
-    """The scene and the disturbance that a file describes.
+    """Return the scene and the disturbance that a file describes.
 
-    A station has its camera's `position_m`, a placement the `translation_m` of world_from_target; both have one of
+    A station has its camera's `position_m`, a placement the `translation_m` of world_from_target. Both have one of
     `euler_rad` (the paper's angles) and `rotation_vector`, of cam_from_world and world_from_target. A view without
-    `points` or `curves` looks for all that its target has.
+    `points` or `curves` observes all that its target has.
 
     Args:
         data: the file as plain data.
-        where: how to name the file in messages.
+        where: name of the file in messages.
 
     Raises:
         InputError: one line that names `where` and the place in it.
@@ -125,12 +125,13 @@ def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
 
 
 def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
-    """What is true of simulated observations: intrinsics, stations, placements, and the disturbed rows of each file.
+    """Return the true values behind simulated observations: intrinsics, stations, placements, and each file's disturbed
+    rows.
 
     Poses are given to 1e-10 m and rad, intrinsics with every digit.
 
     Args:
-        simulations: name of the file of observations -> what was simulated. Their scenes must agree on shared names.
+        simulations: name of the file of observations -> its simulation. Their scenes must agree on shared names.
     """
     truth: dict[str, Any] = {
         "format": TRUTH_FORMAT,
@@ -169,7 +170,7 @@ def _station_truth(station: Station) -> dict[str, Any]:
 
 
 def _tidy(numbers: ArrayLike) -> Any:
-    """Metres or radians to 1e-10, far below what can be measured: the same digits on every machine."""
+    """Round metres or radians to 1e-10, far below what can be measured, so that all machines give the same digits."""
     return (np.round(np.asarray(numbers, dtype=float), 10) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
 
 
@@ -185,10 +186,10 @@ def _rows_truth(truth: Truth) -> dict[str, Any]:
 
 
 def write_simulation(simulation: Simulation, folder: str | Path, more_truth: Mapping[str, Any] | None = None) -> None:
-    """Write `observations.json` and `truth.json` into a folder, which is made where it is missing.
+    """Write `observations.json` and `truth.json` into a folder, which is created if it does not exist.
 
     Args:
-        more_truth: what the truth says besides.
+        more_truth: further entries of the truth.
 
     Raises:
         InputError: it cannot be written.

@@ -1,4 +1,4 @@
-"""What a simulation is made from: a scene (who stands where, what is looked at), and what disturbs observing it."""
+"""Inputs of a simulation: a scene (where things are, what is observed), and the disturbance of its observations."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ceres_cal.scene import SIDES, Camera, Target
 class ViewPlan(Frozen, eq=True):
     """What frames taken at one station show of one target: one view per frame.
 
-    The frames of a plan differ in their noise, outliers, wrong labels and hidden stretches only; many frames in one
+    The frames of a plan differ only in their noise, outliers, wrong labels and hidden stretches. Many frames in one
     plan are fast, because the target is projected once.
 
     Attributes:
         frames: names of the frames.
         station: where they are taken.
         target: what they show.
-        placement: where the target is; None: it lies in the world.
-        points: names of the points looked for; None: all that the target has, crossings of its curves apart.
-        curves: names of the curves looked for; None: all that the target has.
-        spacing_m: distance along a curve from one curve observation to the next.
-        side: which part of the paint is observed: "centre", "left" or "right".
+        placement: where the target is; None: in the world.
+        points: names of the observed points; None: all of the target's points except crossings of its curves.
+        curves: names of the observed curves; None: all of the target's curves.
+        spacing_m: distance along a curve between curve observations.
+        side: part of the paint that is observed: "centre", "left" or "right".
     """
 
     frames: tuple[str, ...]
@@ -40,18 +40,18 @@ class ViewPlan(Frozen, eq=True):
 
 
 class Scene(Frozen, eq=True):
-    """The truth of a simulation: everything that is, and what is looked at.
+    """The truth of a simulation: all objects, and what is observed.
 
     Attributes:
         targets: by name.
-        cameras: name -> intrinsics; their own pose is not used.
+        cameras: name -> intrinsics; the cameras' own poses are not used.
         stations: name -> camera and cam_from_world.
         placements: name -> world_from_target of a movable target.
-        views: what is looked at.
-        photography: how photographs of it are taken, by name of what, where it says so.
+        views: what is observed.
+        photography: settings of its photographs by name, if there are any.
 
     Raises:
-        InputError: on construction: a name that is not there, a number that cannot be; the line names the place.
+        InputError: on construction: an unknown name, an impossible number; the line names the place.
     """
 
     targets: Mapping[str, Target]
@@ -94,26 +94,26 @@ class Scene(Frozen, eq=True):
             raise InputError(f"{here}: side {plan.side!r} is unknown: {', '.join(SIDES)}")
 
     def camera_at(self, station: str) -> Camera:
-        """The camera of a station, at the station's pose."""
+        """Return the camera of a station, at the station's pose."""
         place = self.stations[station]
         return self.cameras[place.camera].at(place.cam_from_world)
 
     def world_from_target(self, placement: str | None) -> Pose:
-        """Where the target of a view lies: its placement, or the world itself."""
+        """Return the pose of a view's target: its placement, or the identity for a target in the world."""
         return Pose.identity() if placement is None else self.placements[placement]
 
 
 class Disturbance(Frozen, eq=True):
-    """What disturbs the observations of every frame; nothing does by default.
+    """Disturbances of the observations of every frame; by default there are none.
 
     Attributes:
         points_sigma_px: standard deviation of each coordinate of the point observations.
-        curves_sigma_px: standard deviation of each coordinate of the curve observations, and so of the distance to
-            the curve.
+        curves_sigma_px: standard deviation of each coordinate of the curve observations, and so of the distance to the
+            curve.
         outliers: share of the observations that are moved far, in addition to the noise.
         outlier_spread_px: standard deviation of each coordinate of that move.
-        wrong_labels: share of the observations with a wrong name: a point has that of any other point of its target,
-            a curve observation that of the curve next to it.
+        wrong_labels: share of the observations with a wrong name: a point gets that of any other point of its target, a
+            curve observation that of the nearest other curve.
         hidden_stretches: number of stretches of curve per view that are not seen, each somewhere on the curves in view.
         hidden_length_m: length of such a stretch; it ends where its curve does.
         hidden_points: share of the points that are not seen.

@@ -1,4 +1,4 @@
-"""From a scene to its observations: what each frame shows, with noise, outliers, wrong labels and hidden stretches."""
+"""Simulated observations of a scene: what each frame shows, with noise, outliers, wrong labels and hidden stretches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
 
 
 class Truth(Frozen):
-    """What the rows of the points or of the curves of a simulation show in truth.
+    """True values of the rows of a simulation's points or curves.
 
     Attributes:
         flag: (N,) CLEAN, OUTLIER or WRONG_LABEL.
@@ -33,7 +33,7 @@ class Truth(Frozen):
 
 
 class Simulation(Frozen):
-    """Observations of a scene, and their truth row by row."""
+    """Observations of a scene, and their true values row by row."""
 
     scene: Scene
     disturbance: Disturbance
@@ -44,10 +44,10 @@ class Simulation(Frozen):
 
 
 class _InView(Frozen):
-    """The N places on a target that a plan's camera can see: what all frames of the plan choose from.
+    """The N places on a target that a plan's camera can see, from which all frames of the plan choose.
 
-    `position_m` is the place along the plan's curves laid end to end, and ascends; `neighbour` is the curve next to the
-    place. Points have neither. `features` is how many names a wrong label can be drawn from.
+    `position_m` is the place along the plan's curves laid end to end, ascending; `neighbour` is the nearest other
+    curve. Both are None for points. `features` is the number of names from which a wrong label is drawn.
     """
 
     feature: Indices32
@@ -60,15 +60,15 @@ class _InView(Frozen):
 
 
 _Rows = tuple[Curves, Truth]
-"""Columns of the observations of one plan, whose views count from the first of all plans, with their truth."""
+"""Columns of the observations of one plan, with views numbered across all plans, and their true values."""
 
 
 def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0) -> Simulation:
-    """Observe a scene.
+    """Simulate the observations of a scene.
 
     Only what is in front of the camera, within the lens's monotone radius and inside the image is observed; an
-    observation that its noise moves out of the image is lost. Views without any observation are left out. `sigma_px` of
-    the observations is the disturbance's, 1 where that is 0. The same scene, disturbance and seed give the same rows.
+    observation that noise moves out of the image is lost. Views without any observation are left out. `sigma_px` of the
+    observations is the disturbance's, 1 where that is 0. The same scene, disturbance and seed give the same rows.
 
     Raises:
         InputError: a camera sees nothing at all.
@@ -93,7 +93,7 @@ def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0
 
 
 def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -> tuple[Indices, Array]:
-    """Which of the target's points (N, 3) the camera sees, and their pixels."""
+    """Return which of the target's points (N, 3) the camera sees, and their pixels."""
     points_world = scene.world_from_target(plan.placement).transform(points)
     ahead = np.flatnonzero(camera.cam_from_world.transform(points_world)[:, 2] > 0.0)
     pixels = camera.project(points_world[ahead])
@@ -122,7 +122,7 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
     places, positions, features, start = [np.empty((0, 3))], [np.empty(0)], [chosen[:0]], 0.0
     for i in chosen:
         curve = target.curves[target.curve_names[i]]
-        # Places in the middle of equal pieces: none at an end, and none twice on a closed circle.
+        # Places are in the middle of equal pieces: none at an end, and none twice on a closed circle.
         pieces = max(1, round(curve.length_m / plan.spacing_m))
         share = (np.arange(pieces) + 0.5) / pieces
         low, high = curve.parameter_range
@@ -139,7 +139,9 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
 
 
 def _neighbours(target: Target, feature: Indices32, places: Array) -> Indices32:
-    """For each place (N, 3) on a curve, the nearest other curve of the target; the same one where there is no other."""
+    """For each place (N, 3) on a curve, return the nearest other curve of the target; the same curve if it is the only
+    one.
+    """
     nearest, distance = feature.copy(), np.full(len(places), np.inf)
     for i, curve in enumerate(target.curves.values()):
         away = distance_to_curve(curve, places)
@@ -160,7 +162,7 @@ def _hidden_points(in_view: _InView, frames: int, disturbance: Disturbance, rng:
 
 
 def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Mask:
-    """(frames, N) which places on curves are hidden: each stretch lies around one of the places in view."""
+    """(frames, N) which places on curves are hidden; each stretch is centred on one of the places in view."""
     count, stretches, position = len(in_view.feature), disturbance.hidden_stretches, in_view.position_m
     if position is None or count == 0 or stretches == 0:
         return np.zeros((frames, count), dtype=bool)
@@ -170,7 +172,7 @@ def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, r
     reach = 0.5 * disturbance.hidden_length_m
     start = np.maximum(curve_start[middle], np.searchsorted(position, position[middle] - reach, side="left"))
     end = np.minimum(curve_end[middle], np.searchsorted(position, position[middle] + reach, side="right"))
-    # How many stretches cover a place: one more from each start on, one less from each end on.
+    # The number of stretches that cover a place increases by one at each start and decreases by one at each end.
     change = np.zeros((frames, count + 1), dtype=np.int32)
     frame = np.arange(frames)[:, None]
     np.add.at(change, (frame, start), 1)
@@ -195,7 +197,7 @@ def _observe(
     pixels[far] += disturbance.outlier_spread_px * rng.standard_normal((len(far), 2))
     true_feature = in_view.feature[place]
     feature = _mislabel(in_view, place, flag, rng)
-    flag[(flag == WRONG_LABEL) & (feature == true_feature)] = CLEAN  # there is no other name
+    flag[(flag == WRONG_LABEL) & (feature == true_feature)] = CLEAN  # no other name exists
     view, side = (first_view + frame).astype(np.int32), np.full(len(place), in_view.side, dtype=np.int8)
     rows = Curves(view, feature, pixels, np.full(len(place), sigma_px or 1.0), side)
     kept = np.flatnonzero(in_image(pixels, in_view.image_size))
@@ -203,7 +205,7 @@ def _observe(
 
 
 def _mislabel(in_view: _InView, place: Indices, flag: Codes, rng: np.random.Generator) -> Indices32:
-    """The features as they are named: those of WRONG_LABEL rows by another name, where there is one."""
+    """Return the features as named: WRONG_LABEL rows get another name, if there is one."""
     feature = in_view.feature[place]
     wrong = np.flatnonzero(flag == WRONG_LABEL)
     if in_view.neighbour is not None:

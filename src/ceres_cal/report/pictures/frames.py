@@ -1,6 +1,6 @@
-"""Which photograph shows what: frames by their names, what lies in them, and what was observed there.
+"""Frames of photographs: which photograph shows what, and what was observed there.
 
-Photographs out of image files, and pictures as bytes of them.
+Photographs are read from image files, and pictures are encoded as image files.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Shown = tuple[tuple[str, str | None], ...]
 
 
 class Frame(Frozen, eq=True):
-    """One photograph: its frame's name, the station that took it, what it shows, and numbers of its views."""
+    """One photograph: name of the frame, station that took it, what it shows, and numbers of its views."""
 
     name: str
     station: str
@@ -31,7 +31,7 @@ class Frame(Frozen, eq=True):
 
 
 def frames_of(observations: Observations) -> tuple[Frame, ...]:
-    """The frames of each station, in the order of their views."""
+    """Return the frames of each station, in the order of their views."""
     rows_of: dict[tuple[str, str], list[int]] = {}
     for number, view in enumerate(observations.views):
         rows_of.setdefault((view.frame, view.station), []).append(number)
@@ -47,7 +47,7 @@ def frames_of(observations: Observations) -> tuple[Frame, ...]:
 
 
 def frame_by_name(calibration: Calibration, station: str, name: str) -> Frame:
-    """What a photograph shows as far as the calibration alone tells: what lies in the world, and the board or rings
+    """Return what a photograph shows according to the calibration alone: targets in the world, and the board or rings
     whose placement has the photograph's name.
 
     Raises:
@@ -66,8 +66,8 @@ def frame_by_name(calibration: Calibration, station: str, name: str) -> Frame:
 
 
 def photographs_of(images: Iterable[Path], observations: Observations) -> dict[tuple[str, str], Path]:
-    """The image file of each frame and station that is called like the frame. Where folders are called like stations or
-    cameras, each has its own.
+    """Return the image file of each frame and station, which has the frame's name. If folders are named like stations
+    or cameras, each uses its own folder.
 
     Raises:
         InputError: two images for one frame of a station.
@@ -89,7 +89,7 @@ def photographs_of(images: Iterable[Path], observations: Observations) -> dict[t
 
 
 def model_of(calibration: Calibration, frame: Frame, height_m: float = 0.0) -> Model:
-    """The calibration's model of a frame.
+    """Return the calibration's model of a frame.
 
     Raises:
         InputError: the calibration does not know the frame's station, or a target or placement of it.
@@ -107,9 +107,7 @@ def model_of(calibration: Calibration, frame: Frame, height_m: float = 0.0) -> M
 
 
 def marks_of(calibration: Calibration, observations: Observations, frame: Frame) -> Iterator[Layer]:
-    """What was observed in a frame: what took part and, where the calibration was made from these observations, what
-    was taken out.
-    """
+    """Yield the observations in a frame: inliers and, if the calibration was made from these observations, outliers."""
     both: tuple[Columns, Columns] = observations.points, observations.curves
     inliers: Sequence[Mask] = [np.ones(len(columns), dtype=bool) for columns in both]
     if observations.digest == calibration.digest:
@@ -124,7 +122,7 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
 
 
 def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Image:
-    """A camera's photograph as (height, width) or (height, width, 3), pixels as stored.
+    """Read a camera's photograph as (height, width) or (height, width, 3), pixels as stored.
 
     Raises:
         InputError: no image, or of another size than the camera's.
@@ -140,7 +138,7 @@ def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Ima
 
 
 def jpeg_of_at_most(picture: Image, widest_px: int, most_bytes: int) -> bytes:
-    """A JPEG no wider than that, as good as the bytes allow."""
+    """Encode a JPEG no wider than `widest_px`, with the best quality that fits into `most_bytes`."""
     qualities = (90, 80, 70, 55, 40, 25)
     width, height = picture.shape[1], picture.shape[0]
     if width > widest_px:

@@ -1,10 +1,8 @@
 """Overlay pictures: models and observations drawn into a photograph, with a legend.
 
-What was seen in a photograph that was refused: the best candidate, and which of its lines were missing.
-
-Where in a photograph something is that should be measured.
-
-The model as a photograph should show it: the lines and points of targets as built, as pixels.
+Also: what was seen in a rejected photograph (the best candidate, and which of its lines were missing); where in a
+photograph a recommended measurement is; and the model as a photograph should show it, the lines and points of targets
+as built, in pixels.
 """
 
 from __future__ import annotations
@@ -23,9 +21,10 @@ from ceres_cal.problem import Estimate
 from ceres_cal.scene import Camera, Target, along_track, curve_points, in_image
 
 Colour = tuple[int, int, int]
-"""Blue, green, red."""
+"""Blue, green, red, 0 to 255."""
 COLOURS: dict[str, Colour] = {
-    "before": (255, 190, 0),  # cyan: apart from magenta for colour-blind eyes, and neither is paint nor carpet
+    # cyan: colour-blind readers can distinguish it from magenta, and neither occurs in paint or carpet
+    "before": (255, 190, 0),
     "after": (200, 0, 255),
     "lifted": (0, 220, 255),
     "used": (255, 120, 30),
@@ -39,16 +38,16 @@ _STYLE = {
     "letter_px": 18.0,
     "pad_px": 8.0,
     "font_px": 22.0,  # height of the font's capitals at scale 1
-    "paper": 0.82,  # how much of the photograph the legend's ground hides
+    "paper": 0.82,  # opacity of the legend's background
 }
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
+_SHIFT = 4  # fractional bits in OpenCV's drawing coordinates
 
 
 class Layer(Struct, frozen=True, eq=False):
-    """A model, or observed pixels (N, 2), in one of COLOURS; its label stands in the legend.
+    """A model, or observed pixels (N, 2), in one of COLOURS; the label is for the legend.
 
-    Pixels are dots, or crosses for what was taken out.
+    Pixels are drawn as dots, or as crosses for outliers.
     """
 
     shown: Model | Array
@@ -58,10 +57,10 @@ class Layer(Struct, frozen=True, eq=False):
 
 
 def draw_overlay(photograph: Image, layers: Sequence[Layer]) -> Image8:
-    """A photograph with models and pixels drawn into it, the last on top: (height, width, 3) blue, green, red, 8 bit.
+    """Draw models and pixels into a photograph, the last on top: (height, width, 3) blue, green, red, 8 bit.
 
-    Lines run where the model says, to 1/16 px; the eye compares them with the paint. How well that is known they do
-    not tell.
+    Lines are drawn where the model predicts them, to 1/16 px, for comparison with the paint by eye. Their uncertainty
+    is not shown.
     """
     canvas = in_8_bit_colour(photograph)
     thick = max(1.0, float(np.hypot(*canvas.shape[:2])) / _STYLE["usual_px"])
@@ -81,7 +80,7 @@ def draw_overlay(photograph: Image, layers: Sequence[Layer]) -> Image8:
 
 
 def in_8_bit_colour(image: Image) -> Image8:
-    """A copy of any photograph as (height, width, 3) uint8; deeper ones are stretched to what they hold."""
+    """Copy any photograph as (height, width, 3) uint8; deeper ones are stretched to the range of their values."""
     plain = np.array(image)
     if plain.dtype != np.uint8:
         low, high = float(plain.min()), float(plain.max())
@@ -109,7 +108,7 @@ def _draw_dots(canvas: Image8, pixels: Array, radius: float, colour: Colour) -> 
 
 
 def _drawable(pixels: Array, canvas: Image8) -> Mask:
-    """(N,) whether pixels are numbers and not so far outside that OpenCV's coordinates overflow."""
+    """(N,) whether pixels are finite and not so far outside that OpenCV's coordinates overflow."""
     height, width = canvas.shape[:2]
     return np.asarray(np.all(np.abs(pixels - (0.5 * width, 0.5 * height)) < (2.0 * width, 2.0 * height), axis=1))
 
@@ -122,7 +121,7 @@ def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: f
     letter, pad = _STYLE["letter_px"] * thick, _STYLE["pad_px"] * thick
     scale, row = letter / _STYLE["font_px"] / 1.4, 1.3 * letter
     stroke = max(1, round(thick))
-    texts = [label.encode("ascii", "replace").decode() for label, _ in entries]  # the font has no other letters
+    texts = [label.encode("ascii", "replace").decode() for label, _ in entries]  # the font has ASCII letters only
     widest = max((cv2.getTextSize(text, _FONT, scale, stroke)[0][0] for text in texts), default=0)
     sample = 2.0 * row
     top, right = int(canvas.shape[0] - row * len(texts) - 2.0 * pad), int(3.0 * pad + sample + widest)
@@ -138,7 +137,7 @@ def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: f
 
 
 def draw_seen(photograph: Image, seen: FieldLines | None, target: Target) -> Image8:
-    """A photograph with the lines found in it, and, of the best candidate, where paint was found and where not."""
+    """Draw into a photograph the lines found in it, and where paint of the best candidate was found and where not."""
     grey = in_8_bit_colour(photograph).mean(axis=2).astype(np.float32)
     layers = [Layer(find_strokes(grey).ends.reshape(-1, 2), "lines seen", "before")]
     if seen is not None:
@@ -155,8 +154,8 @@ def draw_seen(photograph: Image, seen: FieldLines | None, target: Target) -> Ima
 def places_in_picture(
     measurement: Measurement, targets: Mapping[str, Target], camera: Camera
 ) -> Iterator[tuple[str, Array]]:
-    """What is drawn, with a label, (N, 2) px each: the outline of a board, a pole from its foot to its top, a line, or
-    the place beneath a camera whose height is to be measured.
+    """Yield what is drawn for a measurement, with a label, (N, 2) px each: the outline of a board, a pole from its foot
+    to its top, a line, or the place beneath a camera whose height is to be measured.
     """
     pieces = 30
     if measurement.kind == "tape":
@@ -179,8 +178,8 @@ def places_in_picture(
 
 
 class Model(Struct, frozen=True, eq=False):
-    """What is drawn into a photograph of `image_size`: lines, and points (N, 2) px. Of each line there is its middle
-    (S, 2) px, NaN where the camera does not show it, and behind it both edges of wide paint.
+    """What is drawn into a photograph of `image_size`: lines, and points (N, 2) px. Each line consists of its middle
+    (S, 2) px, NaN where the camera does not show it, followed by both edges if the paint is wide.
     """
 
     image_size: tuple[int, int]
@@ -189,12 +188,12 @@ class Model(Struct, frozen=True, eq=False):
 
     @property
     def in_view(self) -> int:
-        """How many of its lines and points the photograph shows, lines in part at least."""
+        """Number of lines and points that the photograph shows, at least in part."""
         lines = sum(bool(np.any(self._inside(middle))) for middle, *_ in self.lines)
         return lines + int(np.count_nonzero(self._inside(self.points)))
 
     def apart_px(self, other: Model) -> tuple[float, float]:
-        """How far the places of another model of the same things lie from these, px: median and largest.
+        """Median and largest distance, px, to the places of another model of the same things.
 
         NaN where the photograph shows no place of both.
         """
@@ -215,12 +214,12 @@ def model_seen(
     shown: Sequence[tuple[str, str | None]],
     height_m: float = 0.0,
 ) -> Model:
-    """The model of what a station sees.
+    """Return the model of what a station sees.
 
     Args:
-        estimate: cameras, poses and targets as built. targets: those that it was made for, as drawn.
-        shown: target and placement of each thing; placement None for what lies in the world.
-        height_m: everything is lifted by so much along its target's z.
+        estimate: cameras, poses and targets as built. targets: the nominal targets that it was made for.
+        shown: target and placement of each thing; placement None for a target in the world.
+        height_m: height by which everything is lifted along its target's z.
     """
     built = estimate.structure.built(targets)
     lift = Pose(np.eye(3), np.array([0.0, 0.0, height_m]))
@@ -235,8 +234,8 @@ def model_seen(
 
 
 def _lines(target: Target, points: Array, tracks: Array, camera: Camera) -> Iterator[tuple[Array, ...]]:
-    wide_px = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
-    steps = 240  # along a curve
+    wide_px = 5.0  # width from which on paint is drawn by its two edges, so that it remains visible
+    steps = 240  # number of places along a curve
     for number, curve in enumerate(target.curves.values()):
         s, is_arc = np.linspace(*curve.parameter_range, steps), bool(target.is_arc[number])
         middle, left, right = (camera.project(along_track(tracks[side, number], is_arc, s)) for side in (0, 1, -1))
@@ -249,7 +248,7 @@ def _lines(target: Target, points: Array, tracks: Array, camera: Camera) -> Iter
 
 
 def _between(corners: Array) -> Array:
-    """Corners (C, 3) and places on the straight lines from each to the next."""
-    between = 12  # steps from one corner of a board to the next
+    """Corners (C, 3) and places on the straight lines between consecutive ones."""
+    between = 12  # number of steps from one corner of a board to the next
     at = np.linspace(0.0, len(corners) - 1.0, between * (len(corners) - 1) + 1)
     return np.column_stack([np.interp(at, np.arange(len(corners)), axis) for axis in corners.T])

@@ -1,7 +1,7 @@
 """Straightened images: what a camera without distortion would have seen from the same place.
 
-The straight image's camera is a pinhole on square pixels that looks the same way. It can show less than half a sphere,
-and what lies far off the axis is stretched ever more: therefore an angle of view that is never exceeded.
+The straight image's camera is a pinhole with square pixels and the same viewing direction. It can show less than half a
+sphere, and what is far off the axis is stretched more and more; therefore the angle of view is limited.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from ceres_cal.scene.lens import Brown
 WIDEST_DEG = 150.0
 MOST_STRETCH = 4.0
 _GRID, _ROUNDS, _SHRINK = 9, 24, 0.6
-_ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms
+_ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms of width over height
 
 
 class Straightening(Struct, frozen=True, eq=False):
     """How photographs of one camera are straightened.
 
     Attributes:
-        camera: the straight image's own: a pinhole at the photograph's pose. What it projects and locates holds in
+        camera: camera of the straight image, a pinhole at the photograph's pose; its projection and location apply to
             the straight image.
         warp: makes the images.
-        share: of the photograph's pixels, that the straight image shows.
-        limit_deg: angle off the axis from which on nothing is shown, because the lens has no answer there or draws
-            pixels out too much, or for `angle_deg`; None where the photograph ends before.
+        share: share of the photograph's pixels that the straight image shows.
+        limit_deg: angle off the axis beyond which nothing is shown, because of `angle_deg`, or because the lens has no
+            answer there or stretches pixels too much; None where the photograph ends before.
     """
 
     camera: Camera
@@ -53,17 +53,17 @@ def straighten(
     phi: float | None = None,
     angle_deg: float | None = None,
 ) -> Straightening:
-    """How to straighten a camera's photographs.
+    """Return how to straighten a camera's photographs.
 
     Args:
-        camera: any lens, with the pose that the straight image's camera shall have.
-        whole: everything that the photograph shows, with black around it; else the largest upright rectangle in which
-            every pixel shows something (OpenCV's alpha 1 and 0, but the pixels stay square).
+        camera: any lens, with the pose for the straight image's camera.
+        whole: show everything that the photograph shows, with black around it; else the largest upright rectangle in
+            which every pixel shows something (as OpenCV's alpha 1 and 0, but pixels remain square).
         size: (width, height) px of the straight image; the photograph's by default.
         phi: instead of a size: the focal length, px; the camera's own keeps the scale in the middle.
-        angle_deg: what is farther than half of it off the axis is left out: whatever the lens, a straight image ends
-            before 180 degrees. None: 150 and, of a rectangle, as far as pixels are not drawn out more than 4 times as
-            in the middle. What lies close to where a lens folds is nothing but that.
+        angle_deg: angle of view; what is farther off the axis than half of it is left out. A straight image always ends
+            before 180 degrees. None: 150 degrees and, for a rectangle, as far as pixels are stretched at most 4 times
+            as much as in the middle. Near the angle where a lens folds, all pixels are stretched more than that.
 
     Raises:
         InputError: an image without pixels or too large, or nothing within the angle.
@@ -106,8 +106,8 @@ def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bo
 
 
 def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
-    """The share of the photograph's pixels, of every few, whose centres fall into the straight image."""
-    counted = 100_000  # pixels of a photograph, about, of which it is told whether they are shown
+    """Share of the photograph's pixels, evenly sampled, whose centres fall into the straight image."""
+    counted = 100_000  # approximate number of pixels that are sampled
     width, height = camera.image_size
     step = max(1, int(np.sqrt(width * height / counted)))
     pixels = grid_places(np.arange(0.0, width, step), np.arange(0.0, height, step))
@@ -124,7 +124,7 @@ class _ShownRegion(Struct, frozen=True, eq=False):
     Attributes:
         slope: distance from the axis beyond which nothing is shown. limit_deg: the same as an angle; None where the
             photograph ends before.
-        outline: (Q, 2) places along its border, without order.
+        outline: (Q, 2) places along its border, in no order.
     """
 
     camera: Camera
@@ -140,7 +140,7 @@ class _ShownRegion(Struct, frozen=True, eq=False):
 
 
 def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
-    """Where the rays of pixels (N, 2) meet the plane at depth 1, (N, 2); NaN beyond the slope."""
+    """(N, 2) where the rays of pixels (N, 2) meet the plane at depth 1; NaN beyond the slope."""
     rays = camera.rays(pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
         there = rays[:, :2] / np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
@@ -166,11 +166,12 @@ def _region(camera: Camera, angle: float) -> _ShownRegion:
 
 
 def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
-    """The angle off the axis, up to `most_rad`, to which the lens has answers and draws nothing out more than that.
+    """Largest angle off the axis, up to `most_rad`, at which the lens has an answer and stretches by at most
+    `most_stretch`.
 
-    Measured along the image's x axis: lenses are the same all around, but for Brown's decentring.
+    Measured along the image's x axis: lenses are rotationally symmetric except for Brown's decentring.
     """
-    endless = 1e12  # a stretch that no limit is meant to forbid
+    endless = 1e12  # an effectively unlimited stretch
     angle_step = 1e-6
     halvings = 60
 
@@ -201,17 +202,17 @@ def _border(size: tuple[int, int]) -> Array:
 
 
 def _box(region: _ShownRegion) -> Array:
-    """(2, 2) the low and the high corner around all of it."""
+    """(2, 2) low and high corner of the region's bounding box."""
     return np.array([region.outline.min(axis=0), region.outline.max(axis=0)])
 
 
 def _largest_rectangle(region: _ShownRegion, aspect: float | None) -> Array:
-    """(2, 2) the low and the high corner of the largest upright rectangle inside; `aspect` is width over height.
+    """(2, 2) low and high corner of the largest upright rectangle inside; `aspect` is width over height.
 
-    Around a centre the rectangle grows until it meets the outline: its half height is the smallest of
-    max(|dx| / aspect, |dy|) over the outline. Centre and aspect are sought on a grid that closes in on the best.
+    A rectangle around a centre grows until it meets the outline: its half height is the smallest of max(|dx| / aspect,
+    |dy|) over the outline. Centre and aspect are searched on a grid that shrinks around the best.
     """
-    roughly = 2000  # places of the outline, for the search
+    roughly = 2000  # number of places of the outline used in the search
     rough = region.outline[:: max(1, len(region.outline) // roughly)]
     low, high = _box(region)
     best = np.append(0.5 * (low + high), 0.0)
@@ -232,7 +233,7 @@ def _largest_rectangle(region: _ShownRegion, aspect: float | None) -> Array:
 
 
 def _half_height(outline: Array, centres: Array, aspects: Array) -> Array:
-    """(N,) of the rectangles around centres (N, 2) that touch the outline."""
+    """(N,) half heights of the rectangles around centres (N, 2) that touch the outline."""
     return np.array(
         [
             np.min(np.maximum(np.abs(outline[:, 0] - x) / aspect, np.abs(outline[:, 1] - y)))

@@ -1,10 +1,10 @@
-"""Resampling a photograph: every pixel of a new picture from the place in the photograph that it shows.
+"""Resampling of photographs: every pixel of a new picture is taken from its place in the photograph.
 
-Pixel (0, 0) is the centre of the top-left pixel in both. A photograph reaches half a pixel beyond the centres of its
-outermost pixels; a new pixel that looks past that, or at what the camera has no answer for, is black.
+Pixel (0, 0) is the centre of the top-left pixel in both. A photograph extends half a pixel beyond the centres of its
+outermost pixels; a new pixel outside it, or where the camera has no answer, is black.
 
-And the top view: a plane on the field or above it, seen from straight above at a scale of one's choice. x points right
-and y up, as on the field's drawing. What stands higher or lower than the plane is shown displaced.
+Also the top view: a plane on the field or above it, seen from straight above at any scale. x points right and y up, as
+in the field's drawing. What is higher or lower than the plane appears displaced.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, Array32, Image, InputError, Mask
 from ceres_cal.scene.camera import Camera
 
-MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767
+MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # the limit of OpenCV's remap is 32 767
 
 
 class Warp(Struct, frozen=True, eq=False):
     """Where in the photograph the pixels of a new picture lie.
 
-    Where many pixels of the photograph fall into one of the picture, that one is the mean over `fine` x `fine` small
+    Where many pixels of the photograph fall into one of the picture, that pixel is the mean over `fine` x `fine` small
     squares, so that thin lines become fainter there, not broken.
 
     Attributes:
-        size: (width, height) of the picture. photograph_size: of the photographs that it is made of.
-        fine: squares along a pixel. x, y: (height, width) times `fine`, place of each square in the photograph, px.
+        size: (width, height) of the picture. photograph_size: (width, height) of the photographs.
+        fine: number of squares along a pixel. x, y: (height, width) times `fine`, place of each square in the
+            photograph, px.
         seen: (height, width) times `fine`, whether the photograph shows it.
     """
 
@@ -43,13 +44,14 @@ class Warp(Struct, frozen=True, eq=False):
 
     @property
     def black(self) -> int:
-        """How many pixels of the picture show nothing."""
+        """Number of pixels of the picture that show nothing."""
         width, height = self.size
         squares = self.seen.reshape(height, self.fine, width, self.fine)
         return int(np.count_nonzero(~np.any(squares, axis=(1, 3))))
 
     def apply(self, photograph: Image) -> Image:
-        """The picture, in the photograph's depth and channels; cubic, to 1/64 px of where it should be taken from.
+        """Make the picture, with the photograph's depth and channels, by cubic interpolation at places rounded to 1/64
+        px.
 
         Raises:
             ValueError: the photograph has another size.
@@ -69,10 +71,10 @@ def require_size(size: tuple[int, int], advice: str) -> None:
 
 
 def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: Callable[[Array], Array]) -> Warp:
-    """The warp of a new picture.
+    """Make the warp of a new picture.
 
     Args:
-        size: (width, height) of the picture, one that `require_size` lets pass.
+        size: (width, height) of the picture, accepted by `require_size`.
         places: pixels (N, 2) of the picture -> pixels (N, 2) of the photograph, NaN where there are none.
     """
     x, y = _placed(size, places)
@@ -84,8 +86,8 @@ def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: C
 
 
 def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Array32, Array32]:
-    """Places of all pixels and of one more around them."""
-    block = 1 << 18  # new pixels at a time
+    """Places of all pixels, and of one more around them on each side."""
+    block = 1 << 18  # new pixels processed at a time
     across, down = (np.arange(-1.0, count + 1.0) for count in size)
     there = np.empty((len(down), len(across), 2), dtype=np.float32)
     rows = max(1, block // len(across))
@@ -97,16 +99,18 @@ def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Ar
 
 
 def _divided(plane: Array32, fine: int) -> Array32:
-    """Of each pixel `fine` x `fine` squares, between their neighbours' middles; without the pixels around."""
+    """Divide each pixel into `fine` x `fine` squares, interpolated between neighbouring pixels; the pixels around are
+    removed.
+    """
     size = fine * plane.shape[1], fine * plane.shape[0]
     squares = plane if fine == 1 else cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(squares[fine:-fine, fine:-fine])
 
 
 def _squares_along(x: Array32, y: Array32) -> int:
-    """How many pixels of the photograph most of the new ones span."""
-    usual = 0.9  # of all pixels: those that decide how many squares are needed
-    finest = 4  # small squares along a pixel
+    """Number of pixels of the photograph that most of the new ones span, limited."""
+    usual = 0.9  # quantile of the spans that decides how many squares are needed
+    finest = 4  # largest number of small squares along a pixel
     spans = [np.hypot(np.diff(x, axis=axis), np.diff(y, axis=axis)).ravel() for axis in (0, 1)]
     finite = np.concatenate(spans)
     finite = finite[np.isfinite(finite)]
@@ -118,7 +122,7 @@ def _squares_along(x: Array32, y: Array32) -> int:
 
 
 class TopViewGrid(Struct, frozen=True):
-    """What part of which plane a top view shows, and how large.
+    """Which part of which plane a top view shows, and at what scale.
 
     Attributes:
         corner_m: x and y of the picture's upper left corner: the smallest x, the largest y. size: (width, height) px.
@@ -132,18 +136,18 @@ class TopViewGrid(Struct, frozen=True):
 
     @property
     def area_m(self) -> tuple[float, float, float, float]:
-        """x0, y0, x1, y1 between the picture's edges."""
+        """x0, y0, x1, y1 of the picture's edges, m."""
         x, y = self.corner_m
         return x, y - self.size[1] * self.m_per_px, x + self.size[0] * self.m_per_px, y
 
     def places(self, pixels: ArrayLike) -> Array:
-        """Pixels (N, 2) of the top view -> places (N, 2) on the plane, m."""
+        """Places (N, 2) on the plane, m, of pixels (N, 2) of the top view."""
         steps = (np.asarray(pixels, dtype=float) + 0.5) * self.m_per_px
         return np.asarray(self.corner_m + steps * [1.0, -1.0])
 
 
 def make_grid(area_m: tuple[float, float, float, float], m_per_px: float, height_m: float = 0.0) -> TopViewGrid:
-    """The grid of pixels over an area.
+    """Make the grid of pixels over an area.
 
     Args:
         area_m: x0, y0, x1, y1; widened to whole pixels at its right and lower edge.
@@ -163,7 +167,7 @@ def make_grid(area_m: tuple[float, float, float, float], m_per_px: float, height
 
 
 def top_view(camera: Camera, grid: TopViewGrid) -> Warp:
-    """How the photographs of a station (a camera posed in the world) become top views.
+    """Return the warp from photographs of a station (a camera posed in the world) to top views.
 
     Raises:
         InputError: the camera sees nothing of the area.
