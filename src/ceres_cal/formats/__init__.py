@@ -1,4 +1,4 @@
-"""The languages of others: one module for each format that a calibration can be exported to, and the table of them."""
+"""Formats of other programs: one module for each format that can be exported or imported, and a table of them."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -1,5 +1,5 @@
-"""COLMAP's text model through pycolmap: all stations as one rig in one frame. Its pixels begin at the corner of the
-first one: half a pixel is added on the way out, and taken off on the way in.
+"""COLMAP's text model, by pycolmap: all stations as one rig in one frame. Its pixel coordinates have their origin at
+the corner of the first pixel, so half a pixel is added on export and subtracted on import.
 
 src colmap/colmap doc/format.rst.
 """
@@ -25,7 +25,8 @@ _MODELS = {
     FISHEYE: "OPENCV_FISHEYE",
     THIN_PRISM_FISHEYE: THIN_PRISM_FISHEYE,
 }
-_COUNTS = {"FULL_OPENCV": 8, THIN_PRISM_FISHEYE: 8}  # coefficients behind fx fy cx cy; of the others four
+# number of coefficients after fx fy cx cy; the other models have four
+_COUNTS = {"FULL_OPENCV": 8, THIN_PRISM_FISHEYE: 8}
 _HALF = 0.5
 
 
@@ -81,13 +82,13 @@ def _rigid(pose: Pose) -> Any:
 
 
 def read_model(folder: Path) -> Any:
-    """COLMAP's model; InputError where the folder holds none, a pipe or a device, or too much."""
+    """Read COLMAP's model; InputError where the folder holds none, a pipe or a device, or too much."""
     if not folder.is_dir():
         raise InputError("COLMAP's model is a folder: name that")
     for name in ("rigs", "cameras", "frames", "images", "points3D"):
         for path in (folder / f"{name}.bin", folder / f"{name}.txt"):
             if path.exists():
-                read_bytes(path)  # the library opens them itself: what it would wait for is refused here
+                read_bytes(path)  # the library opens the files itself; files on which it would wait are refused here
     try:
         return _library().Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
@@ -109,7 +110,8 @@ def _read(request: ImportRequest) -> Any:
     if not cameras:
         raise InputError("none of its images has a pose")
     stems = {_stem(name): camera for name, camera in cameras.items()}
-    if len(stems) == len(cameras):  # else like images in different folders: whole names tell them apart
+    # otherwise images in different folders have the same name: whole names distinguish them
+    if len(stems) == len(cameras):
         cameras = stems
     warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")
     return calibration_of("COLMAP", cameras, warnings=warnings)

@@ -1,5 +1,5 @@
-"""Observations that others wrote: mrcal's corners.vnl, a CSV or NPZ with named columns, what an mrcal .cameramodel was
-calibrated from, and the keypoints of a COLMAP model.
+"""Observations from other programs: mrcal's corners.vnl, CSV or NPZ with named columns, the observations in an mrcal
+.cameramodel, and the keypoints of a COLMAP model.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _read_corners(
     camera: Annotated[str, "name of the camera; default: camera"] = "camera",
     sigma_px: Annotated[float, "of a corner at level 0; default: 1"] = 1.0,
 ) -> Observations:
-    """`# filename x y level`, a line for each corner, row by row; '-' or a level below 0 was not found."""
+    """Read `# filename x y level`, one line for each corner, row by row; '-' or a level below 0 means not found."""
     if min(columns, rows) < 2 or not square > 0.0:
         raise InputError("the board is not said in the file: give columns, rows and square (m)")
     board = checkerboard(columns, rows, square)
@@ -67,13 +67,13 @@ def _read_corners(
 
 _COLUMNS = ("frame", "camera", "station", "placement", "point", "curve", "side", "x_px", "y_px", "sigma_px")
 _PLACE = ("X_m", "Y_m", "Z_m")
-_BYTES_PER_CELL = 150  # of memory, in a row by names
-_ZIP = b"PK"  # how an NPZ file begins
+_BYTES_PER_CELL = 150  # bytes of memory for a cell of a row by names
+_ZIP = b"PK"  # first bytes of an NPZ file
 
 
 def _csv_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
-    """Rows by names, and the names; with semicolons or tabs between them, as spreadsheets write where decimals have a
-    comma, which is read as a point then.
+    """Return rows by names, and the names. Columns may be separated by semicolons or tabs, as in spreadsheets with
+    decimal commas; commas are then read as decimal points.
     """
     head = request.content.partition(b"\n")[0]
     between = next((mark for mark in (",", ";", "\t") if mark.encode() in head), ",")
@@ -97,7 +97,7 @@ def _csv_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tupl
 
 
 def _npz_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
-    """Rows by names, and the names."""
+    """Return rows by names, and the names."""
     columns = read_foreign_npz(request.content, str(request.path))
     require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
     lengths = {array.shape for array in columns.values()}
@@ -115,7 +115,7 @@ def _read_table(
     camera: Annotated[str, "name of the camera where no column says it"] = "camera",
     moves: Annotated[bool, "whether the target lay elsewhere in every frame (true)"] = False,
 ) -> Observations:
-    """Rows under named columns; each shows a point or a curve of the target, or a place in the world."""
+    """Read rows under named columns; each shows a point or a curve of the target, or a place in the world."""
     is_npz = request.path.suffix.lower() == ".npz" or request.content.startswith(_ZIP)
     rows, names = (_npz_rows if is_npz else _csv_rows)(request)
     if len(set(names)) < len(names):
@@ -197,7 +197,7 @@ def _index(numbers: Mapping[str, int], name: str, number: int) -> int:
 
 
 def _read_mrcal(request: ImportRequest) -> Observations:
-    """The `optimization_inputs` of a .cameramodel: boards before static cameras."""
+    """Read the `optimization_inputs` of a .cameramodel: boards before static cameras."""
     data = literal_of(request.content)
     if "optimization_inputs" not in data:
         raise InputError("it has no optimization_inputs: mrcal did not keep what it calibrated from")
@@ -217,7 +217,7 @@ def _read_mrcal(request: ImportRequest) -> Observations:
         frame, camera = f"{indices[row, 0]:04d}", f"camera{indices[row, 1]}"
         views.append(View(frame, camera, camera, "board", frame))
         seen = boards[row].reshape(-1, 3)
-        found = np.flatnonzero(seen[:, 2] > 0.0)  # weights; below 0 was an outlier or was not seen
+        found = np.flatnonzero(seen[:, 2] > 0.0)  # weights; negative for outliers and corners not seen
         view.append(np.full(len(found), number))
         feature.append(found)
         pixels.append(seen[found, :2])
@@ -229,7 +229,9 @@ def _read_mrcal(request: ImportRequest) -> Observations:
 
 
 def _read_colmap(request: ImportRequest) -> Observations:
-    """The keypoints that show points of the model, in our pixels; the points count as known."""
+    """Read the keypoints that show points of the model, converted to this package's pixels; the points are taken as
+    known.
+    """
     model = read_model(request.path)
     if not model.num_points3D():
         raise InputError("the model has no points")
@@ -252,7 +254,7 @@ FORMATS = (
     ImportFormat("corners-vnl", "mrcal's corners.vnl", (".vnl",), lambda _: True, _read_corners),
     ImportFormat("csv", f"observations as CSV, {_NAMED}", (".csv",), lambda _: True, _read_table),
     ImportFormat("npz-columns", "the same as an array for each column", (".npz",), lambda _: True, _read_table),
-    # By their names alone: the same files are read as cameras by default.
+    # Only by their names: by default these files are read as cameras.
     ImportFormat(
         "mrcal-observations", "what a .cameramodel was made from", (".cameramodel",), lambda _: False, _read_mrcal
     ),

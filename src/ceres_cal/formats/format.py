@@ -1,4 +1,6 @@
-"""What a format is: it makes files of a calibration and says what they get wrong, or reads the files of others."""
+"""Definition of formats: an export makes files from a calibration and states their errors; an import reads other
+programs' files.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class ExportLoss(Struct, frozen=True):
-    """What a file gets wrong about one station, against the calibration that it was made from: 0 where it is exact.
+    """Errors of a file for one station, compared with the calibration that it was made from; 0 where it is exact.
 
     Attributes:
         field_mm: height_m -> root mean square and largest error over the field, mm.
-        image_px: the same over the observed image, px; None where the file does not project.
+        image_px: root mean square and largest error over the observed image, px; None where the file does not project.
     """
 
     station: str
@@ -33,10 +35,10 @@ class Export(Frozen):
     """A calibration in a format.
 
     Attributes:
-        content: of the file, or by name of the files in a folder.
+        content: content of the file, or by name that of the files in a folder.
         losses: one for each station.
-        words: what it is, for people. facts: the same for scripts, as JSON has them.
-        warnings: what to know of those who will read it, a line each.
+        words: description for users. facts: the same for scripts, in the form of JSON.
+        warnings: one line for each thing that readers of the file should know.
     """
 
     content: bytes | Mapping[str, bytes]
@@ -46,7 +48,7 @@ class Export(Frozen):
     warnings: tuple[str, ...] = ()
 
     def require_loss_mm(self, most: float | None) -> None:
-        """Raise InputError where a station is wrong by more than so many mm anywhere on the field."""
+        """Raise InputError where the error of a station exceeds `most` mm anywhere on the field."""
         for loss in self.losses if most is not None else ():
             worst = max((worst for _, worst in loss.field_mm.values()), default=float("inf"))
             if not worst <= most:  # type: ignore[operator]
@@ -73,9 +75,9 @@ class ExportRequest(Struct, frozen=True, eq=False):
     """What is to be exported.
 
     Attributes:
-        stations: names, one or, where the format holds several, any number.
-        ending: of the file that is asked for, one of the format's.
-        existing: content of the file of that name before; only for formats that edit it, None where there is none.
+        stations: names; one or, where the format holds several, any number.
+        ending: ending of the requested file, one of the format's.
+        existing: previous content of that file, only for formats that edit it; None where there is none.
     """
 
     calibration: Calibration
@@ -85,14 +87,14 @@ class ExportRequest(Struct, frozen=True, eq=False):
 
 
 class ExportFormat(Struct, frozen=True):
-    """A format.
+    """A format for export.
 
     Attributes:
-        name: as it is asked for. description: one line.
-        endings: that its file may have, the usual one first; none where it is a folder of files.
-        export: makes it; raises InputError where the calibration cannot be said in the format. Its options are what it
-            takes by keyword: each Annotated[type, help], with a default; on the command line --error-mm for error_mm.
-        most_stations: that a file holds, None of any number. edits: whether an existing file is edited.
+        name: by which users choose it. description: one line.
+        endings: possible endings of its file, the usual one first; empty if it is a folder of files.
+        export: makes it; raises InputError where the format cannot represent the calibration. Its options are its
+            keyword parameters: each Annotated[type, help], with a default; on the command line --error-mm for error_mm.
+        most_stations: largest number of stations in a file, None for any. edits: whether an existing file is edited.
     """
 
     name: str
@@ -103,7 +105,7 @@ class ExportFormat(Struct, frozen=True):
     edits: bool = False
 
     def holds(self, stations: int) -> bool:
-        """Whether a file holds so many stations."""
+        """Whether a file can hold so many stations."""
         return self.most_stations is None or stations <= self.most_stations
 
     @property
@@ -125,7 +127,7 @@ class ImportRequest(Struct, frozen=True, eq=False):
     """What is to be read.
 
     Attributes:
-        path: of the file or folder. content: of the file, empty of a folder.
+        path: of the file or folder. content: of the file; empty for a folder.
     """
 
     path: Path
@@ -138,12 +140,13 @@ class ImportRequest(Struct, frozen=True, eq=False):
 
 
 class ImportFormat(Struct, frozen=True):
-    """A format.
+    """A format for import.
 
     Attributes:
-        name: as it is asked for; that of the export format, where there is one. description: one line.
-        endings: that its file may have. recognises: whether a file that ends so is one, by its content.
-        read: makes what it holds; raises InputError, whose text need not name the file. Its options are like those of
+        name: by which users choose it; the same as that of the export format, if there is one. description: one line.
+        endings: possible endings of its file. recognises: whether the content of a file with this ending is in the
+            format.
+        read: returns what it holds; raises InputError, whose text need not name the file. Its options are like those of
             an `ExportFormat`.
     """
 
@@ -165,13 +168,13 @@ def calibration_of(
     targets: Mapping[str, scene.Target] | None = None,
     warnings: Sequence[str] = (),
 ) -> Calibration:
-    """The cameras of a file, by name, as a calibration of which nobody says how well it is known.
+    """Make a calibration of unknown accuracy from the cameras of a file, by name.
 
-    A camera without a pose is the world, as one that saw only boards.
+    A camera without a pose defines the world, like a camera that saw only boards.
 
     Args:
-        source: what was read, in words. cameras: ours or others'. targets: that the file describes. warnings: what to
-            know of it, a line each.
+        source: description of what was read. cameras: this package's or other programs' cameras.
+        targets: targets that the file describes. warnings: one line for each thing to know.
     """
     from ceres_cal.calibration import Calibration, Fit
     from ceres_cal.problem import EXACT, Estimate, Options, Station

@@ -1,5 +1,5 @@
-"""Kalibr's camchain: cameras one after the other, each with its pose in the one before. It has no world: as mrcal does
-it, the first camera's T_cn_cnm1 is its pose over the field.
+"""Kalibr's camchain: a chain of cameras, each with its pose relative to the one before. It has no world; as in mrcal,
+the first camera's T_cn_cnm1 is its pose over the field.
 
 src https://github.com/ethz-asl/kalibr/wiki/yaml-formats.
 """
@@ -19,7 +19,7 @@ from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, camera_matrix
 
 _MODELS = {"opencv4": "radtan", FISHEYE: "equidistant"}
-_PROJECTIONS = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # how many numbers stand before the four of K
+_PROJECTIONS = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # number of parameters before the four of K
 _DISTORTIONS = {"none": 0, "radtan": 4, "equidistant": 4, "fov": 1}
 
 
@@ -90,7 +90,7 @@ def _camera(entry: Mapping[str, Any], key: str, pose: Pose | None) -> ForeignCam
 
 
 def _distort(model: str, own: Array, bent: str, coefficients: Array) -> Callable[[Array], Array]:
-    """Kalibr's projection, then its distortion, at focal length 1."""
+    """Return Kalibr's projection followed by its distortion, at focal length 1."""
 
     def distort(rays: Array) -> Array:
         x, y, z = rays.T

@@ -1,7 +1,8 @@
-"""A look-up table from pixels to the field, for those who track at many frames a second without this package.
+"""Look-up table from pixels to the field, for programs that track at many frames a second without this package.
 
-A ray meets the plane z = l where it meets the floor plus l times a constant of the pixel: the change with height that
-the third column of the paper's H makes (section 4), exact for every height. So four numbers per node are enough.
+A ray meets the plane z = l where it meets the floor plus l times a constant of the pixel. This is the change with
+height of the third column of the paper's H (section 4), and exact for every height. So four numbers per node are
+enough.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ _COLUMNS: dict[str, Column] = {
 
 
 class LookupTable(Frozen):
-    """Where on the field the nodes of a grid over the image look.
+    """Places on the field seen by the nodes of a grid over the image.
 
     Attributes:
-        x_px (X,), y_px (Y,): the nodes, evenly spaced by step_px, from outside the image to outside of it.
-        floor_m: (Y, X, 2) x and y on the floor; NaN where a node sees none. per_height: (Y, X, 2) what to add for each
-            metre of height.
-        error_mm: height_m -> root mean square and largest error of bilinear interpolation, half way between nodes,
-            over the given box of the field.
-        homography: (3, 3) the paper's H of the floor. third_column: (3,) what its third column gains per metre.
+        x_px (X,), y_px (Y,): the nodes, evenly spaced by step_px, beginning and ending outside the image.
+        floor_m: (Y, X, 2) x and y on the floor; NaN where a node sees none. per_height: (Y, X, 2) change for each metre
+            of height.
+        error_mm: height_m -> root mean square and largest error of bilinear interpolation, half-way between nodes, over
+            the given box of the field.
+        homography: (3, 3) the paper's H of the floor. third_column: (3,) change of its third column per metre.
     """
 
     station: str
@@ -59,7 +60,7 @@ class LookupTable(Frozen):
     third_column: Array
 
     def locate(self, pixels: ArrayLike, height_m: float = 0.0) -> Array:
-        """Pixels (N, 2) -> places (N, 2) m at a height, interpolated; NaN outside of the table."""
+        """Return places (N, 2) m at a height for pixels (N, 2), interpolated; NaN outside the table."""
         at = (np.asarray(pixels, dtype=float) - (self.x_px[0], self.y_px[0])) / self.step_px
         inside = np.all((at >= 0.0) & (at <= (len(self.x_px) - 1, len(self.y_px) - 1)), axis=1)
         at = np.where(inside[:, None], at, 0.0)
@@ -71,7 +72,7 @@ class LookupTable(Frozen):
         return np.where(inside[:, None], (1.0 - v) * upper + v * lower, np.nan)
 
     def to_bytes(self) -> bytes:
-        """The content of its NPZ file."""
+        """Return the content of its NPZ file."""
         stream = io.BytesIO()
         errors = [(height_m, *error) for height_m, error in self.error_mm.items()]
         content: dict[str, Any] = {**vars(self), "error_mm": errors}
@@ -97,12 +98,12 @@ class LookupTable(Frozen):
 
 
 def _table_of(arrays: Mapping[str, AnyArray]) -> LookupTable:
-    """The table that an NPZ file holds; ValueError where its numbers contradict each other."""
+    """Return the table of an NPZ file; ValueError where its numbers contradict each other."""
     if (str(arrays["format"]), int(arrays["version"])) != (FILE_FORMAT, VERSION):
         raise ValueError(f"not of format {FILE_FORMAT}, version {VERSION}")
     nodes = {name: arrays[name] for name in ("x_px", "y_px", "floor_m", "per_height", "homography", "third_column")}
     station, step_px = str(arrays["station"]), int(arrays["step_px"])
-    station.encode()  # or it is no text
+    station.encode()  # fails if it is no text
     size = (int(arrays["image_size"][0]), int(arrays["image_size"][1]))
     errors = {float(height_m): (float(rms), float(worst)) for height_m, rms, worst in arrays["error_mm"]}
     for name, length in zip(("x_px", "y_px"), size, strict=True):
@@ -123,10 +124,10 @@ def _table_of(arrays: Mapping[str, AnyArray]) -> LookupTable:
 def make_lookup_table(
     camera: scene.Camera, station: str, x_m: Array, y_m: Array, error_mm: float = 0.1, step_px: int | None = None
 ) -> LookupTable:
-    """The table of a camera; without a step, the widest grid whose largest error keeps to `error_mm`.
+    """Make the table of a camera; without a step, the widest grid whose largest error is at most `error_mm`.
 
     Args:
-        x_m, y_m: the box of the field over which errors count is the one around these.
+        x_m, y_m: errors count over the box around these places of the field.
 
     Raises:
         InputError: a step below 1 or beyond the image, or no step of 1 px or more keeps to the error.
@@ -156,7 +157,7 @@ def _table(camera: scene.Camera, station: str, step: int, x_m: Array, y_m: Array
 
 
 def _rays(camera: scene.Camera, x: Array, y: Array) -> tuple[Array, Array]:
-    """Where the nodes' rays meet the floor, and how that changes with height, (Y, X, 2) each."""
+    """Return where the nodes' rays meet the floor, and the change of this place with height, (Y, X, 2) each."""
     floor = camera.locate(grid_places(x, y))
     slope = (camera.position[:2] - floor) / camera.position[2]
     shape = (len(y), len(x), 2)

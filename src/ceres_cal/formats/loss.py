@@ -1,4 +1,4 @@
-"""By how much what a file says of a camera differs from the calibration."""
+"""Errors of a file's camera compared with the calibration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Box = tuple[Array, Array]
 def field_error_mm(
     camera: scene.Camera, locate: Callable[[Array, float], Array], pixels: Array, box_m: Box, heights_m: Sequence[float]
 ) -> dict[float, tuple[float, float]]:
-    """height_m -> root mean square and largest error of located pixels, mm.
+    """Return height_m -> root mean square and largest error of located pixels, mm; infinite where no pixel counts.
 
     Args:
-        camera: that knows better. locate: pixels (N, 2) and a height -> places (N, 2) m, NaN where it knows none.
-        pixels: (N, 2); those count that look into the box around the x and y of `box_m`. Infinite where none does.
+        camera: the exact camera. locate: pixels (N, 2) and a height -> places (N, 2) m, NaN where unknown.
+        pixels: (N, 2); those count that see a place in the box around the x and y of `box_m`.
     """
-    edge_m = 1e-6  # places at the box's own edge are in it, whatever the last bit of their way there and back says
+    edge_m = 1e-6  # tolerance, so that rounding does not exclude places on the edge of the box
     errors = {}
     low, high = (np.array([end(axis) for axis in box_m]) for end in (np.min, np.max))
     for height_m in heights_m:
@@ -36,12 +36,12 @@ def field_error_mm(
 
 
 def field_box(targets: Mapping[str, scene.Target]) -> Box | None:
-    """x and y of a grid over what does not move; None where everything does."""
+    """x and y of a grid over targets that do not move; None if all move."""
     return posterior.field_grid(targets) if scene.still(targets) else None
 
 
 def field_pixels(camera: scene.Camera, box_m: Box) -> Array:
-    """(N, 2) pixels in which the camera shows places evenly over the field and a little above it."""
+    """(N, 2) pixels in which the camera shows evenly spaced places on the field and a little above it."""
     places = grid_places(*box_m)
     every = [camera.project(np.column_stack([places, np.full(len(places), h)])) for h in HEIGHTS_M]
     pixels = np.concatenate(every)
@@ -49,16 +49,16 @@ def field_pixels(camera: scene.Camera, box_m: Box) -> Array:
 
 
 def camera_loss(station: str, camera: scene.Camera, project: Callable[[Array], Array], box_m: Box | None) -> ExportLoss:
-    """What a file gets wrong about a camera.
+    """Return the errors of a file's camera.
 
     Args:
-        project: as the file has it, points (N, 3) m -> pixels (N, 2). box_m: of the field, None where there is none.
+        project: the file's projection, points (N, 3) m -> pixels (N, 2). box_m: of the field, None where there is none.
 
     Raises:
-        InputError: parts of the field have no place in what the file says.
+        InputError: the file's camera cannot see parts of the field.
     """
-    rounds = 8  # of bringing a place to where another camera shows it in the same pixel
-    grid = (122, 91)  # pixels: finer than that of the fit
+    rounds = 8  # iterations that find the place that the other camera shows in the same pixel
+    grid = (122, 91)  # number of pixels, finer than the grid of the fit
     pixels = image_grid(camera.image_size, grid)
     rays = camera.rays(pixels)
     known = np.isfinite(rays[:, 0])
@@ -69,7 +69,7 @@ def camera_loss(station: str, camera: scene.Camera, project: Callable[[Array], A
         return ExportLoss(station, {}, image_px)
 
     def locate(seen: Array, height_m: float) -> Array:
-        """Where the file's camera has these pixels: from where ours has them, by what it misses there."""
+        """Locate pixels with the file's camera, iterating from this camera's places by the remaining differences."""
         there = place = camera.locate(seen, height_m)
         for _ in range(rounds):
             shown = project(np.column_stack([place, np.full(len(place), height_m)]))
@@ -88,7 +88,7 @@ def camera_loss(station: str, camera: scene.Camera, project: Callable[[Array], A
 def as_foreign(
     request: ExportRequest, models: Callable[[scene.Camera], Sequence[str]]
 ) -> tuple[list[ForeignCamera], tuple[ExportLoss, ...]]:
-    """The cameras of all stations that are asked for, as `nearest_foreign`, and what is lost of each."""
+    """Return the cameras of all requested stations, as `nearest_foreign` makes them, and their errors."""
     box_m, cameras = field_box(request.calibration.targets), map(request.calibration.station, request.stations)
     every = [
         nearest_foreign(camera, name, models(camera), box_m)
@@ -100,7 +100,9 @@ def as_foreign(
 def nearest_foreign(
     camera: scene.Camera, station: str, models: Sequence[str], box_m: Box | None
 ) -> tuple[ForeignCamera, ExportLoss]:
-    """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""
+    """Return a station's camera in the first of these models that represents it exactly, else the best fit, and the
+    error.
+    """
     foreign = ForeignCamera.of(camera, *models)
     if foreign.error_px == (0.0, 0.0):
         return foreign, ExportLoss(station, {} if box_m is None else dict.fromkeys(HEIGHTS_M, (0.0, 0.0)), (0.0, 0.0))
@@ -109,7 +111,7 @@ def nearest_foreign(
 
 
 def loss_words(loss: ExportLoss) -> list[str]:
-    """What is lost, a line each, for files that have room for it: on the field first, where it counts."""
+    """Words on the errors, one line each, for files that allow comments: on the field first, where they matter."""
     lines = [
         f"{loss.station}: {short(rms, 3)} mm rms, {short(worst, 3)} mm at most, {at_height(height_m)}"
         for height_m, (rms, worst) in loss.field_mm.items()

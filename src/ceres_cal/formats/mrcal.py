@@ -1,4 +1,5 @@
-"""mrcal's .cameramodel: one camera a file, a Python literal. Files of its own calibrations also hold the observations.
+"""mrcal's .cameramodel: one camera a file, a Python literal. Files of mrcal's own calibrations contain observations,
+too.
 
 src dkogan/mrcal mrcal/cameramodel.py, cameramodel-parser.re, doc/cameramodels.org.
 """
@@ -19,7 +20,7 @@ from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera, camera_matrix
 
 _MODELS = {f"LENSMODEL_OPENCV{count}": model for model, count in OPENCV_MODELS.items()}
-_POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
+_POSES = ("rt_cam_ref", "extrinsics")  # names since mrcal 2.5, and before
 
 
 def _export(request: ExportRequest) -> Export:
@@ -38,12 +39,12 @@ def _export(request: ExportRequest) -> Export:
 
 
 def literal_of(content: bytes) -> dict[str, Any]:
-    """The literal of a .cameramodel; InputError where it is none."""
-    bytes_per_comma = 1000  # of memory, for a part of the syntax tree
+    """Return the literal of a .cameramodel; InputError where it is none."""
+    bytes_per_comma = 1000  # bytes of memory for a part of the syntax tree
     text = content.decode("utf-8", errors="replace")
     require_room(bytes_per_comma * text.count(",") + 4.0 * len(text), "the file")
     try:
-        with warnings.catch_warnings(action="ignore"):  # what the compiler thinks of its style
+        with warnings.catch_warnings(action="ignore"):  # silences the compiler's warnings on its style
             data = ast.literal_eval(text.strip())
     except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         raise InputError(f"not a .cameramodel (cut short?): {error}") from None

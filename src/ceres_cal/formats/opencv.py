@@ -1,5 +1,5 @@
-"""OpenCV's FileStorage, as YAML, XML or JSON: one camera under the names of its calibration sample, two under those of
-its stereo sample.
+"""OpenCV's FileStorage, as YAML, XML or JSON: one camera under the names of OpenCV's calibration sample, two under
+those of its stereo sample.
 
 src opencv/opencv samples/cpp/calibration.cpp, stereo_calib.cpp.
 """
@@ -37,7 +37,7 @@ def _export(request: ExportRequest) -> Export:
     for key, value in {"stations": " ".join(request.stations), **entries}.items():
         storage.write(key, value)
     content = storage.releaseAndGetString()
-    if request.ending in (".yml", ".yaml"):  # what readers older than OpenCV 5 know
+    if request.ending in (".yml", ".yaml"):  # the version that readers older than OpenCV 5 accept
         content = re.sub(r"^%YAML[^\n]*", "%YAML:1.0", content)
     models_used = " and ".join(camera.model for camera in cameras)
     named = zip(request.stations, cameras, strict=True)
@@ -46,8 +46,8 @@ def _export(request: ExportRequest) -> Export:
 
 
 def _reader_traps(camera: ForeignCamera) -> list[str]:
-    """What OpenCV makes of a camera."""
-    rough_px = 0.05  # from which on OpenCV's own inverse is worth a word
+    """Return what OpenCV may get wrong about a camera."""
+    rough_px = 0.05  # error of OpenCV's own inverse from which on it is mentioned
     import cv2
 
     if camera.model == FISHEYE:
@@ -63,7 +63,7 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
 
 
 def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:
-    """K, coefficients (1, N) and the pose (1, 6): rvec, tvec."""
+    """Return K, coefficients (1, N) and the pose (1, 6): rvec, tvec."""
     return camera.matrix, np.array([camera.coefficients]), camera.pose.log()[None]
 
 
@@ -79,7 +79,7 @@ def _mono(camera: ForeignCamera, lost: list[str]) -> dict[str, Any]:
 
 
 def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
-    """The names of intrinsics.yml and extrinsics.yml in one file; R, T take the first camera to the second."""
+    """Return the entries of intrinsics.yml and extrinsics.yml for one file; R, T map the first camera to the second."""
     import cv2
 
     first, second = cameras
@@ -101,7 +101,7 @@ def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
 
 
 def _require_shallow(text: str) -> None:
-    """InputError for elements within elements by the dozen: OpenCV reads them by recursion, and dies of thousands."""
+    """Raise InputError for deeply nested elements: OpenCV reads them by recursion, and crashes on thousands."""
     deepest, depth = 32, 0
     for tag in re.finditer(r"<(/?)\w[^<>]*?(/?)>", text):
         depth += -1 if tag[1] else not tag[2]
@@ -147,10 +147,10 @@ def _camera(storage: Any, image_size: str, number: str) -> ForeignCamera:
     coefficients = _mat(storage, (f"D{number}",) if number else _COEFFICIENTS, None).ravel()
     poses = _mat(storage, (f"extrinsic_parameters{number}",), None, needed=False)
     pose = None
-    if poses.shape == (1, 6):  # of several, each is of one view of a board
+    if poses.shape == (1, 6):  # several poses would be those of views of a board
         pose = Pose.exp(poses[0])
         pose = pose if np.any(poses) else None
-    # `distortion_model` is ours, `fisheye_model` that of OpenCV's tutorial (camera_calibration.cpp).
+    # `distortion_model` is this package's name, `fisheye_model` that of OpenCV's tutorial (camera_calibration.cpp).
     fisheye = _text(storage, "distortion_model") == FISHEYE or bool(_real(storage, ("fisheye_model",)))
     return ForeignCamera.opencv(_size(storage, image_size), matrix, coefficients, pose, fisheye=fisheye)
 
@@ -163,7 +163,7 @@ def _size(storage: Any, image_size: str) -> tuple[int, int]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT; InputError where it is none."""
+    """Parse WIDTHxHEIGHT; InputError where it is invalid."""
     found = re.fullmatch(r"\s*(\d+)\s*[xX,]\s*(\d+)\s*", text)
     if not found:
         raise InputError("the image size is not there: give image_size as WIDTHxHEIGHT, such as 1280x960")
@@ -198,7 +198,9 @@ def _mat(storage: Any, names: tuple[str, ...], shape: tuple[int, int] | None, *,
 
 
 def _matrix(node: Any, name: str) -> Array:
-    """What a node holds; InputError where its rows and cols, which OpenCV takes as they are, do not fit its data."""
+    """Return the matrix of a node; InputError where its rows and cols, which OpenCV does not check, do not fit its
+    data.
+    """
     import cv2
 
     refused = InputError(f"{name} must be a matrix: its rows and cols do not fit its data")

@@ -1,4 +1,4 @@
-"""The tables of all formats, the export of a calibration to one of them, and the reading of what others wrote."""
+"""Tables of all formats, the export of a calibration to one of them, and the import of other programs' files."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _MODULES = (lookup, ssl_geometry, ssl_settings, opencv, ros, kalibr, mrcal, colm
 _EVERY: list[ExportFormat | ImportFormat] = [form for module in _MODULES for form in module.FORMATS]
 EXPORT_FORMATS = {form.name: form for form in _EVERY if isinstance(form, ExportFormat)}
 IMPORT_FORMATS = {form.name: form for form in _EVERY if isinstance(form, ImportFormat)}
-"""By their names; those that are read, in the order in which a file is asked whether it is one."""
+"""Formats by name; import formats are tried in this order to recognise a file."""
 
 
 def export_format(name: str) -> ExportFormat:
-    """The format of a name; InputError where there is none."""
+    """Return the format of a name; InputError where there is none."""
     if name not in EXPORT_FORMATS:
         raise InputError(no_such("export format", name, EXPORT_FORMATS))
     return EXPORT_FORMATS[name]
@@ -37,20 +37,21 @@ def export(
     max_loss_mm: float | None = None,
     **options: Any,
 ) -> Export:
-    """Write a calibration to a file of a format, or to a folder where the format takes one.
+    """Write a calibration to a file of a format, or to a folder if the format is a folder.
 
     Args:
-        to: name of the format. stations: by default all where the format holds several, else the only one.
-        max_loss_mm: refuse what is wrong by more anywhere on the field, on the floor or at robot height.
+        to: name of the format.
+        stations: by default all if the format holds several, else the only one.
+        max_loss_mm: refuse an export with a larger error anywhere on the field, on the floor or at robot height.
         options: the format's own.
 
     Returns:
-        what was written, and what it gets wrong.
+        What was written, and its errors.
 
     Raises:
         InputError: no such format, station, option or ending of a file, several stations for a format that holds one, a
-            calibration that cannot be said in the format, or only with more than `max_loss_mm`, or a file that cannot
-            be written.
+            calibration that the format cannot represent, or only with more than `max_loss_mm`, or a file that cannot be
+            written.
     """
     exported = prepare_export(calibration, to, path, stations, options)
     exported.require_loss_mm(max_loss_mm)
@@ -61,7 +62,7 @@ def export(
 def prepare_export(
     calibration: Calibration, to: str, path: str | Path, stations: Sequence[str] | None, options: Mapping[str, Any]
 ) -> Export:
-    """The same, not yet written."""
+    """Make an export without writing it; see `export`."""
     form, path = export_format(to), Path(path)
     return form.export(
         ExportRequest(
@@ -75,10 +76,10 @@ def prepare_export(
 
 
 def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> Calibration | Observations:
-    """What a file of another program holds.
+    """Read a file of another program.
 
     Args:
-        form: name of the format, by default the one that the file's ending and content tell.
+        form: name of the format, by default determined from the file's ending and content.
         options: the format's own.
 
     Raises:
@@ -98,7 +99,7 @@ def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> C
 
 @checked
 def import_calibration(path: str | Path, form: str | None = None, **options: Any) -> Calibration:
-    """The calibration that a file of another program holds: see `read_foreign`.
+    """Read a calibration from a file of another program: see `read_foreign`.
 
     Raises:
         InputError: it holds observations.
@@ -113,7 +114,7 @@ def import_calibration(path: str | Path, form: str | None = None, **options: Any
 
 @checked
 def import_observations(path: str | Path, form: str | None = None, **options: Any) -> Observations:
-    """The observations that a file of another program holds: see `read_foreign`.
+    """Read observations from a file of another program: see `read_foreign`.
 
     Raises:
         InputError: it holds cameras.
@@ -142,7 +143,7 @@ def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat
 
 def _stations(calibration: Calibration, form: ExportFormat, names: Sequence[str] | None) -> tuple[str, ...]:
     if names is None and form.most_stations == 1:
-        calibration.station()  # it complains where there are several
+        calibration.station()  # raises InputError where there are several
     chosen = tuple(calibration.stations) if names is None else tuple(names)
     for name in chosen:
         calibration.station(name)

@@ -1,5 +1,5 @@
-"""ROS camera_info as YAML, as its camera_calibration_parsers read it. It has no pose: that goes beside, as a static
-transform, from the optical frame to the field.
+"""ROS camera_info as YAML, as read by camera_calibration_parsers. It has no pose; the pose is stored beside it as a
+static transform from the optical frame to the field.
 
 src ros-perception/image_common camera_calibration_parsers/src/parse_yml.cpp.
 """

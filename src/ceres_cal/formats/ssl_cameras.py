@@ -1,8 +1,8 @@
-"""Cameras as ssl-vision and vision-processor have them: one focal length, one coefficient, a quaternion, millimetres.
+"""Cameras of ssl-vision and vision-processor: one focal length, one coefficient, a quaternion, millimetres.
 
-p = Q x_field + t; u = p_xy / p_z; |u| = rd (1 + d rd^2); pixel = f u rd / |u| + centre: our `radial` with power 3
-alone, d = a3 phi^2. Of any other lens the best fit on the field is taken, the camera's position held: free, f and
-height would trade off.
+p = Q x_field + t; u = p_xy / p_z; |u| = rd (1 + d rd^2); pixel = f u rd / |u| + centre: this package's `radial` with
+power 3 alone, d = a3 phi^2. For any other lens the best fit on the field is used, with the camera's position held:
+otherwise f and height would trade off.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CameraIds = Annotated[
 
 
 def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
-    """The id of each station's camera.
+    """Return the id of each station's camera.
 
     Raises:
         InputError: not as many different whole numbers as there are stations.
@@ -48,7 +48,7 @@ def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
 def to_entries(
     request: ExportRequest, camera_id: str, box_m: Box | None
 ) -> tuple[dict[int, dict[str, Any]], list[ExportLoss], list[str]]:
-    """id -> SSL_GeometryCameraCalibration as plain data; what is lost; what to know of those who will read it."""
+    """Return id -> SSL_GeometryCameraCalibration as plain data; the errors; and warnings for readers of the message."""
     entries, losses, warnings = {}, [], []
     ids = camera_ids(request.stations, camera_id)
     for name, number in zip(request.stations, ids, strict=True):
@@ -64,8 +64,8 @@ def to_entries(
 
 
 def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]:
-    """What holds a camera better, where one coefficient loses much of it."""
-    much_mm = 10.0  # anywhere on the field: the width of a line
+    """Suggest formats that represent a camera better, if one coefficient causes a large error."""
+    much_mm = 10.0  # largest error anywhere on the field: the width of a line
     worst = max((worst for _, worst in loss.field_mm.values()), default=0.0)
     if not worst > much_mm:
         return []
@@ -79,7 +79,7 @@ def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]
 
 
 def as_before(entry: Mapping[str, Any], before: Mapping[str, Any] | None) -> dict[str, Any]:
-    """An entry, with the numbers of one that was there before where both are the same camera to float32's digits."""
+    """Return an entry with the numbers of an earlier one if both are the same camera to the digits of float32."""
     if before is None or any(name not in before for name in NAMES):
         return dict(entry)
     old, new = (np.array([float(e[name]) for name in NAMES]) for e in (before, entry))
@@ -90,7 +90,7 @@ def as_before(entry: Mapping[str, Any], before: Mapping[str, Any] | None) -> dic
 
 
 def reader_traps(entry: Mapping[str, Any]) -> list[str]:
-    """What those who read an entry make of it."""
+    """Return what readers of an entry may get wrong."""
     if float(entry["distortion"]) < 0.0:
         return [
             "its distortion is negative: ssl-vision locates with it but draws, and states its own RMSE, without "
@@ -100,7 +100,9 @@ def reader_traps(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _nearest(camera: Camera, box_m: Box | None) -> Camera:
-    """The camera with one focal length and one coefficient that locates most alike on the field, at the same place."""
+    """Return the camera with one focal length and one coefficient that locates most similarly on the field, from the
+    same place.
+    """
     if camera.lens.kind == "radial" and camera.lens.powers == (3,) and (camera.aspect, camera.skew) == (1.0, 0.0):
         return camera
     if box_m is None:
@@ -129,18 +131,18 @@ def _nearest(camera: Camera, box_m: Box | None) -> Camera:
 
 
 def to_entry(camera: Camera, number: int) -> dict[str, Any]:
-    """SSL_GeometryCameraCalibration of a camera with a radial lens of power 3, in float32."""
+    """Return SSL_GeometryCameraCalibration of a camera with a radial lens of power 3, in float32."""
     numbers = [camera.phi, *camera.principal_point, camera.lens.values[0] * camera.phi**2]
     numbers += quaternion(camera.cam_from_world.rotation).tolist()
     numbers += [*(1e3 * camera.cam_from_world.translation), *(1e3 * camera.position)]
     named = zip((*NAMES, *_POSITION), numbers, strict=True)
-    single = {name: float(str(np.float32(value))) for name, value in named}  # no more digits than float32 takes
+    single = {name: float(str(np.float32(value))) for name, value in named}  # no more digits than float32 has
     width, height = camera.image_size
     return {"camera_id": number, **single, "pixel_image_width": width, "pixel_image_height": height}
 
 
 def to_cameras(entries: Iterable[Mapping[str, Any]], image_size: str) -> tuple[dict[str, Camera], list[str]]:
-    """The cameras of SSL_GeometryCameraCalibrations by name, and what to know of those who read them."""
+    """Return the cameras of SSL_GeometryCameraCalibrations by name, and warnings for their readers."""
     cameras, warnings = {}, []
     for entry in entries:
         name = f"camera{entry['camera_id']}"
@@ -151,7 +153,7 @@ def to_cameras(entries: Iterable[Mapping[str, Any]], image_size: str) -> tuple[d
 
 
 def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
-    """The camera of an SSL_GeometryCameraCalibration; an image size as WIDTHxHEIGHT for one that has none.
+    """Return the camera of an SSL_GeometryCameraCalibration; `image_size` is WIDTHxHEIGHT for one that has none.
 
     Raises:
         InputError: a number that is missing, or that makes no camera.

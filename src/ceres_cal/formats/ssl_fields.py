@@ -1,5 +1,5 @@
-"""The field of the league's geometry message as a target, and a target as that message: millimetres there, lines whose
-ends and radii are on their centres.
+"""Conversion between targets and the field of the league's geometry message, in which lengths are millimetres, and line
+ends and radii refer to the lines' centres.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.scene import Arc, Curve, Segment, Target, custom, ssl_field
 from ceres_cal.scene.symmetry import samples
 
-_SIZES = {  # of the message: the target's
+_SIZES = {  # name in the message: name in the target
     "field_length": "field_length_m",
     "field_width": "field_width_m",
     "goal_width": "goal_width_m",
@@ -23,7 +23,7 @@ _SIZES = {  # of the message: the target's
     "line_thickness": "line_thickness_m",
     "goal_center_to_penalty_mark": "goal_center_to_penalty_mark_m",
 }
-_A_LENGTH_MM = 10500  # between divisions B and A
+_A_LENGTH_MM = 10500  # limit between divisions B and A
 _RULES = {"goal_depth": 180, "goal_height": 155, "boundary_width": 300, "ball_radius": 21.5, "max_robot_radius": 90.0}
 _SHAPES = "CenterCircle TopTouchLine BottomTouchLine LeftGoalLine RightGoalLine HalfwayLine CenterLine"
 _PENALTY = "LeftPenalty RightPenalty LeftFieldLeftPenalty LeftFieldRightPenalty RightFieldLeftPenalty"
@@ -31,9 +31,9 @@ _TYPES = {*_SHAPES.split(), *(f"{name}Stretch" for name in f"{_PENALTY} RightFie
 
 
 def target_of(field: Mapping[str, Any]) -> Target:
-    """The target that a field message (SSL_GeometryFieldSize as plain data) describes.
+    """Return the target that a field message (SSL_GeometryFieldSize as plain data) describes.
 
-    Its sizes make a field of the league; where its own lines lie elsewhere, those are the target.
+    Its sizes make a field of the league; if its own lines differ from that, they are the target.
 
     Raises:
         InputError: a size that is missing or makes no field, a line or an arc with something else than numbers.
@@ -62,14 +62,14 @@ def _curves(field: Mapping[str, Any]) -> dict[str, Curve]:
         curves[str(line["name"])] = Segment(start, end, 1e-3 * line["thickness"])
     for arc in field.get("field_arcs") or []:
         centre = (1e-3 * arc["center"]["x"], 1e-3 * arc["center"]["y"], 0.0)
-        turn = min(float(arc["a2"]), float(arc["a1"]) + 2.0 * np.pi)  # 2 pi as float32 is a little more
+        turn = min(float(arc["a2"]), float(arc["a1"]) + 2.0 * np.pi)  # 2 pi in float32 is slightly larger
         turn = float(arc["a1"]) + 2.0 * np.pi if turn - float(arc["a1"]) > 2.0 * np.pi - 1e-6 else turn
         curves[str(arc["name"])] = Arc(centre, 1e-3 * arc["radius"], float(arc["a1"]), turn, 1e-3 * arc["thickness"])
     return curves
 
 
 def _alike(one: Curve, other: Curve) -> bool:
-    same_m = 6e-4  # sizes are whole millimetres, the lines are the truth
+    same_m = 6e-4  # tolerance: sizes are whole millimetres, while the lines are exact
     if isinstance(one, Segment) and isinstance(other, Segment):
         ends = np.array([other.start, other.end])
         off = min(np.max(np.abs(np.array(e) - ends)) for e in ((one.start, one.end), (one.end, one.start)))
@@ -81,7 +81,7 @@ def _alike(one: Curve, other: Curve) -> bool:
 
 
 def field_of(target: Target) -> dict[str, Any]:
-    """The message of a target: sizes in whole millimetres, its curves as lines and arcs.
+    """Return the message of a target: sizes in whole millimetres, its curves as lines and arcs.
 
     Raises:
         InputError: it has no curve on the floor, and so is no field.
@@ -120,7 +120,7 @@ def field_of(target: Target) -> dict[str, Any]:
 
 
 def _sizes_of(target: Target) -> dict[str, int]:
-    """The sizes of a field of the league; none of another target."""
+    """Sizes of a field of the league; empty for another target."""
     if target.kind != "ssl-field":
         return {}
     return {theirs: round(1e3 * target.dimensions[ours]) for theirs, ours in _SIZES.items()}

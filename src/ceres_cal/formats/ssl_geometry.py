@@ -1,7 +1,7 @@
 """SSL_GeometryData: the league's geometry message as protobuf, and as vision-processor's geometry.yml.
 
-A file that is there already keeps its field, its ball models and the cameras that are not exported; of a geometry.yml
-only the lines of `calib` are replaced.
+An existing file keeps its field, its ball models and the cameras that are not exported; in a geometry.yml only the
+lines of `calib` are replaced.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ceres_cal.scene import still
 
 
 def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any]) -> tuple[dict[str, Any], Export]:
-    """SSL_GeometryData as plain data, with the field and the other cameras of what was there before.
+    """Return SSL_GeometryData as plain data, with the field and the other cameras of the existing file.
 
     Raises:
-        InputError: neither a field in the calibration nor before.
+        InputError: neither the calibration nor the existing file has a field.
     """
     targets = still(request.calibration.targets)
     if "field" in before:
@@ -57,14 +57,14 @@ def _export_yaml(request: ExportRequest, *, camera_id: CameraIds = "") -> Export
     text = "" if request.existing is None else request.existing.decode("utf-8", errors="replace")
     before = _checked(read_yaml(text)) if text.strip() else {}
     data, exported = geometry_of(request, camera_id, before)
-    to_bytes("SSL_GeometryData", data)  # or says what a reader would refuse
+    to_bytes("SSL_GeometryData", data)  # raises InputError for what a reader would refuse
     if "field" not in before:
         return replace(exported, content=yaml_text(data).encode())
     return replace(exported, content=_with_calib(text, yaml_text({"calib": data["calib"]})).encode())
 
 
 def _with_calib(text: str, block: str) -> str:
-    """A YAML text with its block `calib:` replaced, or added."""
+    """Replace the block `calib:` of a YAML text, or append it."""
     lines = text.splitlines(keepends=True)
     first = next((n for n, line in enumerate(lines) if line.startswith("calib:")), len(lines))
     last = next((n for n in range(first + 1, len(lines)) if lines[n][0] not in " #-\r\n\t"), len(lines))
@@ -74,7 +74,7 @@ def _with_calib(text: str, block: str) -> str:
 
 
 def _checked(data: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a geometry.yml is the message's."""
+    """Return the parts of a geometry.yml that belong to the message."""
     if not isinstance(data.get("field"), dict):
         raise InputError("it has no `field`")
     calib = data.get("calib") or []
@@ -88,8 +88,8 @@ def _checked(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_geometry(content: bytes) -> dict[str, Any]:
-    """A geometry.yml, an SSL_GeometryData or a wrapper packet, as plain data; InputError where it is none of them."""
-    if b"field:" in content:  # a packet holds no names of fields
+    """Read a geometry.yml, an SSL_GeometryData or a wrapper packet as plain data; InputError if it is none of them."""
+    if b"field:" in content:  # a packet contains no names of fields
         data = _checked(read_yaml(content.decode("utf-8", errors="replace")))
         to_bytes("SSL_GeometryData", {**data, "models": data.get("models", {})})
         return data

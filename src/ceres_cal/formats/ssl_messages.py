@@ -1,7 +1,8 @@
-"""The RoboCup small-size league's messages, as far as they concern geometry and where things are seen.
+"""Messages of the RoboCup small-size league, as far as they concern geometry and where things are seen.
 
-`ssl_messages.proto` has them, out of RoboCup-SSL/ssl-vision src/shared/proto; TIGERs-Mannheim's vision-processor has
-the same. Compiled here by `protobuf` into a pool of their own, beside whatever the caller has.
+They are defined in `ssl_messages.proto`, from RoboCup-SSL/ssl-vision src/shared/proto; TIGERs-Mannheim's
+vision-processor has the same. `protobuf` compiles them into a pool of their own, which does not conflict with the
+caller's.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _MESSAGE, _ENUM = 11, 14
 
 @cache
 def message_class(name: str) -> Any:
-    """The class of a message."""
+    """Return the class of a message."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     definition = files("ceres_cal.formats").joinpath("ssl_messages.proto").read_text(encoding="utf-8")
@@ -44,7 +45,7 @@ def message_class(name: str) -> Any:
 
 
 def to_bytes(name: str, data: Mapping[str, Any]) -> bytes:
-    """Plain data under the names of a message, encoded.
+    """Encode plain data under the names of a message.
 
     Raises:
         InputError: a name that the message does not have, a required one missing, or a value of another type.
@@ -61,10 +62,10 @@ def to_bytes(name: str, data: Mapping[str, Any]) -> bytes:
 
 
 def from_bytes(name: str, content: bytes) -> dict[str, Any]:
-    """What an encoded message says, under its names.
+    """Decode a message into plain data under its names.
 
     Raises:
-        InputError: it is none (cut short?), or lacks something that is required.
+        InputError: it is not such a message (cut short?), or lacks a required value.
     """
     from google.protobuf import json_format
     from google.protobuf.message import DecodeError
@@ -80,7 +81,7 @@ def from_bytes(name: str, content: bytes) -> dict[str, Any]:
 
 
 def geometry_from_bytes(content: bytes) -> dict[str, Any]:
-    """An SSL_GeometryData, or that of an SSL_WrapperPacket, as plain data.
+    """Decode an SSL_GeometryData, or that of an SSL_WrapperPacket, into plain data.
 
     Raises:
         InputError: neither, or a packet without geometry.

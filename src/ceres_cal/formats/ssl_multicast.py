@@ -1,6 +1,6 @@
-"""The league's geometry over UDP multicast: sent as ssl-vision and vision-processor do, and received.
+"""The league's geometry over UDP multicast, sent and received as by ssl-vision and vision-processor.
 
-What the commands need of the league's geometry: a packet to send, a field out of what came or lies in a file.
+Also what the commands need of it: a packet to send, and the field of a received packet or of a file.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 
 
 class Group(Struct, frozen=True):
-    """Where vision is published.
+    """Multicast group on which vision is published.
 
     Attributes:
-        address: of a multicast group. interface: address of the own network card, 0.0.0.0 for the system's choice.
+        address: of the multicast group. interface: address of this computer's network card, 0.0.0.0 for the system's
+            choice.
 
     Raises:
-        InputError: the address or the port cannot be.
+        InputError: an invalid address or port.
     """
 
     address: str = "224.5.23.2"
@@ -52,16 +53,16 @@ class Group(Struct, frozen=True):
 
 
 def wrapped(geometry: Mapping[str, Any]) -> bytes:
-    """The wrapper packet of an SSL_GeometryData as plain data; vision-processor takes over any for its camera's id."""
+    """Return the wrapper packet of an SSL_GeometryData as plain data; vision-processor accepts any with its id."""
     return to_bytes("SSL_WrapperPacket", {"geometry": dict(geometry), "source": "SSL_SOURCE_OTHER"})
 
 
 def publish(packet: bytes, group: Group, times: int | None = None, period_s: float = 3.0) -> int:
-    """Send a packet so many times, without end where None; how often it was sent. What ends it early learns of it by
-    `base.files`.
+    """Send a packet so many times, without end for None; return the number of packets sent. If it is interrupted, the
+    number is recorded by `base.errors.note`.
 
     Raises:
-        InputError: the network does not take it.
+        InputError: the network does not accept it.
     """
     ttl = 1  # stays in the local network
     sent = 0
@@ -85,12 +86,12 @@ def publish(packet: bytes, group: Group, times: int | None = None, period_s: flo
 
 
 def received_geometry(group: Group, seconds: float) -> tuple[dict[str, Any], Target, str]:
-    """The first geometry of a field that can be that comes within a time, as plain data, the field, and the address and
-    port that it came from; other packets are passed over.
+    """Wait for the first geometry of a valid field; return it as plain data, the field, and the sender's address and
+    port. Other packets are ignored.
 
     Raises:
-        InputError: none comes (it says from whom others came, and what is wrong with the last), the address is no
-            multicast group, or the network cannot be listened to.
+        InputError: none arrives in time (the message names the senders of others, and what is wrong with the last), the
+            address is no multicast group, or the network cannot be listened to.
     """
     refused: dict[str, str] = {}
     for content, sender in _packets(group, seconds):
@@ -107,14 +108,15 @@ def received_geometry(group: Group, seconds: float) -> tuple[dict[str, Any], Tar
 
 
 def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
-    """Packets to the group alone, none of those to an address of this computer, and who sent each."""
-    ip_multicast_all = 49  # of Linux; Python has no name for it
-    look_s = 60.0  # longest wait at a time: select does not take any number
+    """Yield packets to the group, but not those to an address of this computer, and the sender of each."""
+    ip_multicast_all = 49  # constant of Linux, which Python does not name
+    look_s = 60.0  # longest single wait, as select does not accept any number
     largest = 65536
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
             receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            if sys.platform == "linux":  # or what other programs joined on other network cards comes, too
+            # otherwise packets of groups that other programs joined on other network cards arrive, too
+            if sys.platform == "linux":
                 receiver.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
             receiver.bind((group.address, group.port))
             member = struct.pack("4s4s", socket.inet_aton(group.address), socket.inet_aton(group.interface))
@@ -131,7 +133,7 @@ def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
 def ssl_packet(
     calibration: Calibration, stations: Sequence[str] | None = None, camera_id: str = "", before: Path | None = None
 ) -> tuple[bytes, Export]:
-    """The wrapper packet of a calibration, and what it gets wrong.
+    """Return the wrapper packet of a calibration, and its errors.
 
     Args:
         before: a geometry.yml or a packet with the field and other cameras; by default the calibration's field.
@@ -150,12 +152,12 @@ def ssl_packet(
 
 
 def geometry_content(geometry: Mapping[str, Any], ending: str) -> bytes:
-    """An SSL_GeometryData as plain data, as a file of it."""
+    """Return an SSL_GeometryData, given as plain data, as the content of a file."""
     return to_bytes("SSL_GeometryData", geometry) if ending == ".pb" else yaml_text(geometry).encode()
 
 
 def read_ssl_target(path: str | Path) -> Target:
-    """The field of a geometry.yml, a packet or ssl-vision's robocup-ssl.xml.
+    """Read the field of a geometry.yml, a packet or ssl-vision's robocup-ssl.xml.
 
     Raises:
         InputError: naming the file; it is none of these, or has no field.

@@ -1,4 +1,4 @@
-"""ssl-vision's settings (VarTypes XML): its cameras' values are put into an existing file, nothing else is touched.
+"""ssl-vision's settings (VarTypes XML): the cameras' values in an existing file are replaced, everything else is kept.
 
 src RoboCup-SSL/ssl-vision src/shared/vartypes, src/shared/util/camera_parameters. The file is robocup-ssl.xml beside
 settings.xml. ssl-vision reads it at its start and overwrites it at its end: edit it while ssl-vision is closed.
@@ -24,7 +24,7 @@ from ceres_cal.scene import LARGEST, Target
 _CAMERA, _PARAMETERS, _FIELD = "Camera Calibrator", "Camera Parameters", "Field Configuration"
 _INDEX, _OPENCV = "camera index", "use openCV camera model"
 _XML_NAMES = {name: name.replace("_", " ") if name[0] not in "qt" else name for name in NAMES}
-_SIZES = {  # of the message: of the settings
+_SIZES = {  # name in the message: name in the settings
     "field_length": "Field Length",
     "field_width": "Field Width",
     "goal_width": "Goal Width",
@@ -40,7 +40,7 @@ _SIZES = {  # of the message: of the settings
 
 
 class _Var(Struct, frozen=True):
-    """One value: the names on the way to it, its text, and which bytes of the file are its text.
+    """One value: the path of names to it, its text, and the range of its text's bytes in the file.
 
     Attributes:
         owner: the number of the list that holds it.
@@ -54,13 +54,13 @@ class _Var(Struct, frozen=True):
 
 
 def values_in(content: bytes) -> list[_Var]:
-    """Every value of a settings file.
+    """Return every value of a settings file.
 
     Raises:
         InputError: it is no XML of VarTypes.
     """
     parser, found = expat.ParserCreate(), []
-    open_tags: list[tuple[str, int, int]] = []  # name, number, first byte of what it holds
+    open_tags: list[tuple[str, int, int]] = []  # name, number, first byte of the content
     count, root = 0, ""
 
     def start(tag: str, attributes: dict[str, str]) -> None:
@@ -89,7 +89,7 @@ def values_in(content: bytes) -> list[_Var]:
 
 
 def _cameras(values: list[_Var]) -> dict[int, dict[str, _Var]]:
-    """camera index -> the values of its Camera Parameters by name, and those beside them."""
+    """Return camera index -> the values of its Camera Parameters by name, and those beside them."""
     groups: dict[int, dict[str, _Var]] = {}
     for one in values:
         if _PARAMETERS in one.path and one.path[-2] == _PARAMETERS:
@@ -111,13 +111,13 @@ def _cameras(values: list[_Var]) -> dict[int, dict[str, _Var]]:
 
 
 def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
-    """Index and image size of the calibrator whose parameters begin at a byte, before those of the next."""
+    """Return index and image size of the calibrator whose parameters begin at byte `first`, before the next one's."""
     wanted = (_INDEX, "Image width", "Image height")
     return {one.path[-1]: one for one in values if one.path[-1] in wanted and first <= one.start < last}
 
 
 def _number(one: _Var) -> float:
-    number = one.text.replace(",", ".")  # some locales' printf
+    number = one.text.replace(",", ".")  # decimal comma of some locales
     return finite(number, InputError(f"{one.path[-1]!r} is no number, but {one.text!r}"), LARGEST)
 
 
@@ -180,14 +180,14 @@ def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
 
 
 def _entry(number: int, there: Mapping[str, _Var]) -> dict[str, Any]:
-    """As SSL_GeometryCameraCalibration has it."""
+    """Return the values in the form of SSL_GeometryCameraCalibration."""
     numbers = {name: _number(there[label]) for name, label in _XML_NAMES.items() if label in there}
     sizes = [_number(there[label]) if label in there else 0.0 for label in ("Image width", "Image height")]
     return {"camera_id": number, **numbers, "pixel_image_width": sizes[0], "pixel_image_height": sizes[1]}
 
 
 def settings_target(values: list[_Var]) -> Target:
-    """The field of a settings file; InputError where it has none."""
+    """Return the field of a settings file; InputError where it has none."""
     inside = [one for one in values if _FIELD in one.path]
     if not inside:
         raise InputError("it holds no field: ssl-vision keeps it in robocup-ssl.xml, beside settings.xml")
@@ -199,7 +199,7 @@ def settings_target(values: list[_Var]) -> Target:
 
 
 def _shapes(inside: list[_Var], of: str) -> list[dict[str, Any]]:
-    """Lines or arcs as the message has them."""
+    """Return lines or arcs in the form of the message."""
     groups: dict[int, dict[str, _Var]] = {}
     for one in inside:
         if of in one.path[:-1]:

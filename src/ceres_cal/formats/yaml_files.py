@@ -1,4 +1,4 @@
-"""YAML of others: read with one line of complaint, written with short rows in one line."""
+"""YAML files of other programs: read with errors of one line, written with short rows on one line."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ceres_cal.scene.camera import LARGEST
 
 
 def read_yaml(text: str) -> dict[str, Any]:
-    """A YAML file of names and values.
+    """Read a YAML file of names and values.
 
     Raises:
         InputError: it is none.
     """
     bytes_per_value = 100
-    bytes_per_letter = 200  # of memory, and 10 us, while YAML is read
+    bytes_per_letter = 200  # bytes of memory for each letter while YAML is read, which also takes 10 us
     import yaml
 
     require_room(float(bytes_per_letter * len(text)), "its YAML")
@@ -40,8 +40,9 @@ def read_yaml(text: str) -> dict[str, Any]:
 
 @cache
 def _loader() -> Any:
-    """PyYAML's safe one, but for keys that are there twice, for merged ones, which may multiply without end, and for
-    numbers in base 60 such as 1:30:00, which are text since YAML 1.2: to add them up takes the square of their length.
+    """PyYAML's safe loader with three restrictions: no duplicate keys, no merged keys, which may multiply without end,
+    and no numbers in base 60 such as 1:30:00, which are text since YAML 1.2 and whose sum takes the square of their
+    length.
     """
     import yaml
 
@@ -62,7 +63,7 @@ def _require_unique_keys(_: Any, node: Any) -> None:
 
 
 def _size(value: Any, known: dict[int, float]) -> float:
-    """How many values there are, those behind an alias each time; infinite where something holds itself."""
+    """Number of values, counting those behind an alias each time; infinite where a value contains itself."""
     if not isinstance(value, dict | list | tuple):
         return 1.0
     if id(value) not in known:
@@ -73,14 +74,14 @@ def _size(value: Any, known: dict[int, float]) -> float:
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:
-    """Names and values as YAML, in their order; lists of plain numbers in one line."""
+    """Format names and values as YAML, in their order; lists of plain numbers on one line."""
     import yaml
 
     return str(yaml.safe_dump(dict(data), sort_keys=False, default_flow_style=None, width=120))
 
 
 def numbers_at(values: Any, where: str, count: int | None = None, given: str = "") -> Array:
-    """A list of finite numbers, of lists of them, too, as one array (N,); `given`: how the file has them.
+    """Return a list of finite numbers, possibly nested, as one array (N,); `given`: how the file writes them.
 
     Raises:
         InputError: naming `where`: something else, or another count.
