@@ -1,4 +1,4 @@
-"""The paper's closed forms, which only initialise."""
+"""The initial estimate: closed forms, as the paper's, and a search. They only start the solve."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -1,7 +1,7 @@
-"""The paper's own method from beginning to end, corrected where it errs: the baseline that the bundle is compared with.
+"""The paper's own method from beginning to end, corrected where it errs: a baseline for comparison with the bundle.
 
-Radial coefficients from rings (section 2), the homography of four points (section 3.2), lambda as the larger norm of
-its first two columns (section 3.5). phi is taken as measured beforehand, as the paper does.
+Radial coefficients come from rings (section 2), the homography from four points (section 3.2), and lambda is the larger
+norm of its first two columns (section 3.5). phi is taken as known, as in the paper.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ceres_cal.start.planes import ring_radii
 
 
 def four_point_baseline(sights: Sights, start: Estimate) -> Estimate:
-    """Every station that sees the world posed from four points; a radial lens fitted to rings where there are any.
+    """Pose every station that sees the world from four points, and fit a radial lens to rings where there are any.
 
-    `start` gives phi, the principal point and whatever the paper has no method for.
+    `start` gives phi, the principal point and everything for which the paper has no method.
 
     Raises:
         DegenerateError: a station of the world shows fewer than four points of its floor.
@@ -33,7 +33,7 @@ def four_point_baseline(sights: Sights, start: Estimate) -> Estimate:
         camera = sight.key.camera
         stations[name] = Station(camera, _from_four_points(cameras[camera], sight))
     for key in sights.keys:
-        if key.placement is not None:  # stays where its station saw it
+        if key.placement is not None:  # it stays where its station saw it
             seen = start.stations[key.station].cam_from_world @ start.placements[key.placement]
             placements[key.placement] = stations[key.station].cam_from_world.inverse @ seen
     return Estimate(cameras, stations, placements, start.structure)
@@ -62,7 +62,7 @@ def _from_four_points(camera: Camera, sight: Sights) -> Pose:
 
 
 def _widest_four(places: Array) -> list[int]:
-    """The four points that span the largest quadrilateral: those that noise disturbs least."""
+    """The four points that span the largest quadrilateral, which noise disturbs least."""
 
     def area(four: Iterable[int]) -> float:
         around = places[list(four)] - places[list(four)].mean(axis=0)

@@ -1,7 +1,7 @@
-"""From nothing to a start for the solve, in closed form (design, section 7; the paper's sections 2 and 3).
+"""Find the initial estimate of the solve, in closed form (design, section 7; the paper's sections 2 and 3).
 
-For each camera: the radial profile, one homography per sight, phi, lens coefficients, poses; then the poses are chained
-into stations and placements. Nothing here is the answer: the bundle is.
+For each camera it finds the radial profile, one homography per sight, phi, lens coefficients and poses. Then the poses
+are chained into stations and placements. None of this is the answer: the bundle gives it.
 """
 
 from __future__ import annotations
@@ -29,19 +29,21 @@ from ceres_cal.start.planes import Homographies, profile_and_homographies
 from ceres_cal.start.world import CameraPlace, CameraPlaces, beforehand, chained_poses, left_of, placed
 
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
-"""In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
-of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
+"""Usual phi in half image diagonals, 85 degrees across the diagonal, and a factor either way, 66 to 104 degrees: a
+standard deviation of log phi. It is used where the image does not determine phi, so it is that of usual cameras over a
+field or before a board.
+"""
 _GRID = np.geomspace(*PHI_RANGE, 120)
-_NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
+_NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # one grid step to either side
 
 
 class Start(Frozen, eq=True):
-    """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess".
+    """An initial estimate, and the origin of each camera's phi: "fixed", "views", "prior" or "guess".
 
     Attributes:
-        is_near: whether it is near the minimum, but for private placements: no gross error decides from there.
-        others: that show a station's view alike from elsewhere.
-        keys, poses: sights, and cam_from_frame (K, 3, 4) of each by itself, whatever other cameras say of its frame.
+        is_near: whether it is near the minimum except for private placements, so that gross errors do not dominate.
+        others: other initial estimates, which explain a station's view as well from elsewhere.
+        keys, poses: sights, and cam_from_frame (K, 3, 4) of each by itself, without regard to other cameras.
     """
 
     estimate: Estimate
@@ -54,18 +56,18 @@ class Start(Frozen, eq=True):
 
 @numerical("the initial estimate")
 def initialise(sights: Sights, options: Options) -> Start:
-    """A start for everything the observations show.
+    """Find an initial estimate of everything that the observations show.
 
-    A camera over a field alone, of whose principal point nothing is stated, may show a part of a sensor: where a start
-    from the picture's middle leaves much, those from its quarters are tried, too, where a homography holds: about a
-    right quarter one does, about a wrong one a search only takes its time. Boards tell it by themselves. Where one is
-    stated about which a start leaves much, the middle is tried.
+    A camera that sees only a field, and whose principal point is not stated, may show a part of a sensor. Where the
+    estimate from the picture's middle leaves large residuals, those from its quarters are tried, too, but only by
+    homographies: one holds about the right quarter, and about a wrong one a search only costs time. Boards determine
+    the principal point by themselves. Where a stated principal point leaves large residuals, the middle is tried.
 
     Raises:
-        DegenerateError: naming the sight whose pose the observations do not determine.
+        DegenerateError: it names the sight whose pose the observations do not determine.
     """
-    least_sigmas, better = 5.0, 0.75  # that are left; share of them: a wrong quarter leaves 1.3 to 20 times as many
-    share = 0.22  # of the picture's size, from its middle
+    least_sigmas, better = 5.0, 0.75  # large residuals; ratio of better ones (a wrong quarter: 1.3 to 20)
+    share = 0.22  # distance of the quarters from the middle, as a share of the picture's size
     observations = sights.observations
     start, places = _initialised(sights, options)
     for name, size in observations.cameras.items():
@@ -87,8 +89,9 @@ def initialise(sights: Sights, options: Options) -> Start:
 
 
 def _left(sights: Sights, own: Indices, start: Start, places: Mapping[int, CameraPlace]) -> float:
-    """The median of what a start leaves of all that a camera's own sights hold, in stated sigmas: by the profile that
-    it found. The paper's lens, which stands in its place until one is chosen, may be off by more than a wrong quarter.
+    """The median of what an initial estimate leaves of all rows of a camera's own sights, in stated sigmas, by the
+    profile that it found. The paper's lens, which is used until one is chosen, may be off by more than a wrong quarter
+    is.
     """
     one = sights.take(own)
     seen = one.about(start.estimate.cameras[one.cameras[0]])
@@ -98,7 +101,7 @@ def _left(sights: Sights, own: Indices, start: Start, places: Mapping[int, Camer
 def _initialised(
     sights: Sights, options: Options, *, may_search: bool = True
 ) -> tuple[Start, Mapping[int, CameraPlace]]:
-    """A start, and from where each sight of the world is seen there."""
+    """An initial estimate, and the place from which each sight of the world is seen there."""
     posed = posed_sights(sights, options, may_search=may_search)
     stations, placements = chained_poses(sights, posed.numbers, posed.poses, open_numbers=posed.open)
     structure = options.structure_of(sights.observations.targets)
@@ -116,13 +119,13 @@ def _initialised(
 
 
 class PosedSights(Frozen):
-    """Cameras and the sights that they were posed by.
+    """Cameras, and the sights whose poses were found.
 
     Attributes:
         cameras, phi_from: by name. numbers: (K,) of sights. poses: (K, 3, 4) cam_from_frame.
-        places: number of a sight of the world -> where its camera stands.
-        others: sights of the world that are seen alike from elsewhere: pose (3, 4) and the camera there.
-        open: number of a sight -> names of what it leaves open.
+        places: number of a sight of the world -> the place of its camera.
+        others: sights of the world that look the same from elsewhere, with pose (3, 4) and camera there.
+        open: number of a sight -> names of the numbers that it leaves undetermined.
     """
 
     cameras: dict[str, Camera]
@@ -134,17 +137,17 @@ class PosedSights(Frozen):
     open: dict[int, tuple[str, ...]]
 
     def keys(self, sights: Sights) -> tuple[SightKey, ...]:
-        """(K) of the sights that were posed."""
+        """(K) keys of the sights whose poses were found."""
         return tuple(sights.keys[number] for number in self.numbers.tolist())
 
     def by_key(self, sights: Sights) -> dict[SightKey, Pose]:
-        """cam_from_frame of each."""
+        """cam_from_frame of each of these sights."""
         each = zip(self.keys(sights), self.poses, strict=True)
         return {key: Pose(pose[:, :3], pose[:, 3]) for key, pose in each}
 
 
 def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -> PosedSights:
-    """Every camera with the sights that pose it, each camera by itself.
+    """Find the poses of sights, for each camera by itself.
 
     Raises:
         InputError, SolutionError: see `placed`.
@@ -156,7 +159,7 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
         blank = _blank_camera(name, image_size, given, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
-        # What is stated may be wrong: it is asked where the views do not tell phi, or not where the camera stands.
+        # Statements may be wrong: they are used only where the views do not determine phi or the camera's place.
         posed_by = partial(_start_camera, name, blank, seen, given, may_search=may_search)
         one = attempt(partial(posed_by, ()))  # quiet: it is tried with what is stated, or ends with that
         own_priors = [p for p in priors if _concerns(p, name, seen)]
@@ -185,7 +188,7 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
 def _start_camera(
     name: str, blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior], *, may_search: bool
 ) -> PosedSights:
-    """From the sights of one camera about its principal point, and the priors that concern it."""
+    """Pose the sights of one camera, given about its principal point, with the priors that concern it."""
     unit = unit_px(blank)
     given = _held_profile(blank, sights, options)
     profile, homographies = profile_and_homographies(sights, unit, given)
@@ -193,7 +196,7 @@ def _start_camera(
     poses = dict(zip(homographies.sights.tolist(), _poses_at(homographies, phi), strict=True))
     sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
     of_world = sorted((n for n, key in enumerate(sights.keys) if key.placement is None), key=lambda n: -sizes[n])
-    # Boards tell phi and lens better than what no homography explains.
+    # Boards determine phi and lens better than a sight of the world that no homography explains.
     told = phi_from == "fixed" or (phi_from != "guess" and len(homographies.sights) > 1)
     found: dict[int, CameraPlaces] = {}
     for number in of_world:
@@ -223,8 +226,8 @@ def _start_camera(
 
 
 def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> tuple[float, float]:
-    """Mean and standard deviation of log phi that a search of a sight begins with."""
-    least_sd = 1e-3  # of phi, as a share: a start is no better
+    """Mean and standard deviation of log phi with which the search for a sight begins."""
+    least_sd = 1e-3  # relative, of phi: an initial estimate is no more accurate
     if told:
         return float(np.log(phi)), 0.0
     for prior in priors:
@@ -234,7 +237,7 @@ def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> 
 
 
 def _with_lens(blank: Camera, sights: Sights, profile: RadialProfile, phi: float, options: Options) -> Camera:
-    """The camera with the lens that comes nearest to a profile."""
+    """The camera with the lens that is nearest to a profile."""
     r = RADII * sights.reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
     seen = LensProfile(r, np.arctan2(r, phi * w))
@@ -244,7 +247,7 @@ def _with_lens(blank: Camera, sights: Sights, profile: RadialProfile, phi: float
 
 
 def _held_profile(blank: Camera, sights: Sights, options: Options) -> RadialProfile | None:
-    """That of a lens of which all is held; None where something is free, or depends on a phi that is not held."""
+    """The profile of a lens with all coefficients held; None if one is free, or depends on a phi that is not held."""
     if not set(blank.lens.names) <= set(options.held) or blank.lens.set_at_start:
         return None
     if any(blank.lens.values) and "phi" not in options.fixed and blank.lens.kind != "radial":
@@ -271,7 +274,7 @@ def _poses_at(homographies: Homographies, phi: float) -> Array:
 
 
 def _blank_camera(name: str, image_size: tuple[int, int], options: Options, priors: Sequence[Prior]) -> Camera:
-    """Fixed numbers and principal point put in; phi still to come."""
+    """The camera with fixed numbers and principal point, and without phi."""
     centre = [(image_size[0] - 1) / 2.0, (image_size[1] - 1) / 2.0]
     aspect, skew = options.fixed.get("aspect", 1.0), options.fixed.get("skew", 0.0)
     for prior in priors:
@@ -297,12 +300,12 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
 def _choose_phi(
     sights: Sights, homographies: Homographies, unit: float, options: Options, priors: Sequence[Prior]
 ) -> tuple[float, str]:
-    """phi from r1 . r2 = 0 and |r1| = |r2| over all sights, with what is known beforehand, by a one-dimensional search.
+    """phi from r1 . r2 = 0 and |r1| = |r2| over all sights, with the priors, by a one-dimensional search.
 
-    Where no view is tilted enough and nothing is known, a usual field of view is guessed; the bundle then says
-    how little is known.
+    Where no view is tilted enough and there is no prior, a usual field of view is guessed; the bundle then says how
+    little is known.
     """
-    enough_views = 50  # for phi
+    enough_views = 50  # views that suffice for phi
     if "phi" in options.fixed:
         return options.fixed["phi"], "fixed"
     known = [p for p in priors if p.quantity in ("phi", "height_m", "position_m")]
@@ -339,5 +342,5 @@ def _prior_cost(prior: Prior, phi: Array, sights: Sights, homographies: Homograp
     for value in phi:
         poses = _poses_at(homographies, value)[own]
         heights.append(float(np.mean(-np.sum(poses[:, :, 2] * poses[:, :, 3], axis=1))))
-    spread = max(prior.sigma[-1], 0.01 * abs(prior.value[-1]))  # a start's height is no better than that
+    spread = max(prior.sigma[-1], 0.01 * abs(prior.value[-1]))  # the height of an initial estimate is no more accurate
     return np.asarray(((np.array(heights) - prior.value[-1]) / spread) ** 2)

@@ -1,10 +1,10 @@
-"""Points of flat targets that are listed in another order than the target's: column by column, from the last to the
-first, there and back.
+"""Detect points of flat targets that are listed in another order than the target's: column by column, from the last to
+the first, there and back.
 
-A plane's picture is about a homography, whatever the lens. Points under each other's names make none, and are one again
-once they are read in the order in which they were listed. Orders that look like the target turned or mirrored fit as
-well as its own, so nothing is said of them here: half a turn matters to a rig alone (`same_labels`), and a target that
-is seen from its other side is named after the solve (`calibration.outcome`).
+The picture of a plane is nearly a homography, for any lens. Points under each other's names do not fit a homography,
+but do again if they are read in the order in which they were listed. Orders that look like the target turned or
+mirrored fit as well as its own order, so they are not reported here: half a turn matters only to a rig (`same_labels`),
+and a target that is seen from its other side is reported after the solve (`calibration.outcome`).
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from ceres_cal.base import Array, Indices, InputError, Mask, evenly, first_of, l
 from ceres_cal.observations import Observations, bounds_of, ranges
 from ceres_cal.start.closed_forms import PlaneData, RadialProfile, homographies_of_sights
 
-_FEW = 16  # points of a view by which it is asked whether its order is looked at
-_FEWEST = 6  # points of a view: of four any order makes a homography, and a fifth hardly contradicts it
-# As a factor, by which the right order leaves less: before fisheyes it is 5 and more, and a grid's mirrored order is 1.
+_FEW = 16  # points of a view used to decide whether its order is examined
+_FEWEST = 6  # points of a view: four make a homography in any order, and a fifth hardly contradicts it
+# Factor by which the right order must leave less: before fisheyes it is 5 and more, for a grid's mirrored order it is
+# 1.
 _CLEARLY = 2.0
-# Of a view, that some order fits as well by chance: a thousand views are misjudged once in a thousand times.
+# Probability that some order fits a view as well by chance: a thousand views are misjudged once in a thousand times.
 _BY_CHANCE = 1e-6
 
 
 def require_as_listed(observations: Observations) -> None:
-    """Raise InputError naming the views of a target whose points are listed in another order than the target's."""
+    """Raise InputError if views list a target's points in another order than the target's; it names the views."""
     for name, target in observations.targets.items():
         numbers = np.flatnonzero([view.target == name for view in observations.views])
         places = target.point_array
@@ -45,13 +46,13 @@ def require_as_listed(observations: Observations) -> None:
 
 
 def _in_another_order(observations: Observations, numbers: Indices, places: Array) -> Iterator[tuple[int, str]]:
-    """Numbers of views of a target with points at places (P, 2), and the order in which they list them."""
-    points, most = observations.points, 100  # of a view that are looked at again: a board is no other with more
+    """Numbers of views of a target with points at places (P, 2), and the order in which they list the points."""
+    points, most = observations.points, 100  # points of a view that is examined: more do not change the result
     by_view = np.argsort(points.view, kind="stable")
     counts = np.bincount(points.view, minlength=len(observations.views))
     asked, all_bounds = numbers[counts[numbers] >= _FEWEST], bounds_of(counts)
     if len(asked):
-        evenly_drawn = np.arange(1, _FEW + 1) * 0.6180339887 % 1.0  # in no step that a target's own pattern may have
+        evenly_drawn = np.arange(1, _FEW + 1) * 0.6180339887 % 1.0  # not in the period of a target's own pattern
         few = by_view[all_bounds[asked, None] + (evenly_drawn * counts[asked, None]).astype(np.int64)]
         asked = asked[_is_bent(places[points.feature[few]], points.pixels[few], _between_neighbours(places))]
     if not len(asked):
@@ -60,23 +61,23 @@ def _in_another_order(observations: Observations, numbers: Indices, places: Arra
     words, orders = zip(("", np.arange(len(places))), *_orders(places), strict=True)
     listed = places[np.array(orders)]
     of_all = [_mean_misfits(one[points.feature[rows]], points.pixels[rows], bounds) for one in listed]
-    may_be = np.min(of_all, axis=0) < 0.9 * of_all[0]  # strays decide about it
+    may_be = np.min(of_all, axis=0) < 0.9 * of_all[0]  # a quick test: outliers affect these means
     for number in asked[may_be].tolist():
         own = by_view[all_bounds[number] + evenly(int(counts[number]), most)]
         left_px, by_chance = _left(listed[:, points.feature[own]], points.pixels[own])
-        first = int(np.argmax(left_px <= 1.01 * np.min(left_px)))  # of those that are the same but for a symmetry
+        first = int(np.argmax(left_px <= 1.01 * np.min(left_px)))  # the first of those that are equal by symmetry
         if left_px[first] * _CLEARLY < left_px[0] and by_chance[first] < _BY_CHANCE:
             yield number, words[first]
 
 
 def _is_bent(plane: Array, pixels: Array, between_m: float) -> Mask:
-    """(S,) whether the points of views, at places (S, K, 2), lie so far from a homography that their order is asked
-    for: most lenses leave less, and most calibrations need no more than this.
+    """(S,) whether the points of views, at places (S, K, 2), are so far from a homography that their order is examined.
+    Most lenses leave less, and most calibrations need no more than this test.
 
     Args:
-        between_m: neighbours of the target.
+        between_m: distance between neighbours of the target.
     """
-    least = 0.5  # of the distance between neighbours: a fisheye leaves 0.2 to 0.4, another order 1.4 and more
+    least = 0.5  # share of the distance between neighbours: a fisheye leaves 0.2 to 0.4, another order 1.4 and more
     size_m, size_px = (
         np.linalg.norm(one - one.mean(axis=1, keepdims=True), axis=2).mean(axis=1) for one in (plane, pixels)
     )
@@ -86,14 +87,14 @@ def _is_bent(plane: Array, pixels: Array, between_m: float) -> Mask:
 
 
 def _between_neighbours(places: Array) -> float:
-    """m, of the places (P, 2) of a target, the median."""
+    """Median distance (m) between neighbours among the places (P, 2) of a target."""
     some = places[evenly(len(places), _FEW)]
     apart_m = np.linalg.norm(some[:, None] - places, axis=2)
     return median(np.min(np.where(apart_m > 0.0, apart_m, np.inf), axis=1))
 
 
 def _mean_misfits(plane: Array, pixels: Array, bounds: Indices) -> Array:
-    """(S,) px by which the points of views lie from a homography."""
+    """(S,) px, mean distances of the points of views from a homography."""
     middle = np.add.reduceat(pixels, bounds[:-1]) / np.diff(bounds)[:, None]
     offsets = pixels - np.repeat(middle, np.diff(bounds), axis=0)
     off_px = homographies_of_sights(PlaneData(bounds, plane, offsets), _straight(offsets))[1]
@@ -101,11 +102,11 @@ def _mean_misfits(plane: Array, pixels: Array, bounds: Indices) -> Array:
 
 
 def _left(plane: Array, pixels: Array) -> tuple[Array, Array]:
-    """Of O orders by which a view's points are at places (O, K, 2): (O,) px within which three quarters lie from a
-    homography through four of them, and the probability that so many do by chance. The fours are the same of all
-    orders, so that those which look alike leave the same.
+    """For O orders that put a view's points at places (O, K, 2): (O,) px within which three quarters lie from a
+    homography through four of them, and the probability that so many do by chance. All orders use the same sets of
+    four, so that orders which look alike leave the same.
     """
-    tries = 50  # of a tenth that are strays 33 hold none
+    tries = 50  # sets of four: with a tenth outliers, 33 sets have none
     offsets, (orders, count) = pixels - pixels.mean(axis=0), plane.shape[:2]
     fours = np.random.default_rng(0).permuted(np.tile(np.arange(count), (tries, 1)), axis=1)[:, :4]
     seen = np.tile(offsets[fours].reshape(-1, 2), (orders, 1))
@@ -116,20 +117,20 @@ def _left(plane: Array, pixels: Array) -> tuple[Array, Array]:
         off_px = np.linalg.norm(np.nan_to_num(shown[..., :2] / shown[..., 2:] - offsets, nan=np.inf), axis=3)
     within = 3 * count // 4
     left_px = np.sort(off_px, axis=2)[:, :, within].min(axis=1)
-    area = 12.0 * np.sqrt(np.linalg.det(np.cov(offsets.T)))  # of a rectangle that is evenly filled
+    area = 12.0 * np.sqrt(np.linalg.det(np.cov(offsets.T)))  # px^2, of an evenly filled rectangle
     near = np.minimum(np.pi * left_px**2 / max(area, 1e-9), 1.0)
     by_chance = np.exp(log_binomial_tail(within - 3, count - 4, near))
     return left_px, orders * tries * by_chance
 
 
 def _straight(offsets: Array) -> RadialProfile:
-    """That of a lens that bends nothing."""
+    """The profile of a lens without distortion."""
     return RadialProfile((), float(np.max(np.abs(offsets))))
 
 
 def _orders(places: Array) -> Iterator[tuple[str, Indices]]:
-    """Orders in which points at places (P, 2) may be listed: in words, and the number of the point at each place of the
-    list.
+    """Orders in which points at places (P, 2) may be listed: in words, and the number of the point at each position of
+    the list.
     """
     yield "in reverse order", np.arange(len(places))[::-1]
     x, y = places.round(9).T

@@ -1,7 +1,7 @@
-"""Sights as planes: the radial profile of a camera, and each sight's homography, from any mix of points and lines.
+"""The radial profile of a camera, and the homography of each sight, from any mix of points and lines on planes.
 
-The steps of design section 7, 1 and 2, on top of `closed_forms`: which sights determine what, reweighting and LO-RANSAC
-against wrong labels.
+These are steps 1 and 2 of design section 7, based on `closed_forms`: which sights determine what, with reweighting and
+LO-RANSAC against wrong labels.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from ceres_cal.start.closed_forms import (
     ring_profile,
 )
 
-# A median beyond it may be no fit at all, however even: corners are detected to a tenth of it. Nothing changes from
-# half to double.
+# Median error above which a fit may be wrong, however even: corners are detected to a tenth of it. Halving or doubling
+# changes nothing.
 _ROUGH_PX = 1.0
-# Medians: no clean residual is that long, nine standard deviations. From half to double the answer moves by under 1 %
-# of its error.
+# Length of a wrong residual in medians: no clean residual is that long, nine standard deviations. Halving or doubling
+# moves the answer by less than 1 % of its error.
 _SUSPICIOUS = 8.0
-# Typical distance in a plane scaled to unit size; the fits are 20 times better. Nothing changes from half to double.
+# Typical distance from a fit in a plane scaled to unit size, above which it does not hold; good fits are 20 times
+# better. Halving or doubling changes nothing.
 _NO_FIT = 0.01
 
 
 class PlaneSight(Frozen):
-    """A sight's observations on its plane z = height_m: points, and lines with the pixel that is seen on each.
+    """A sight's observations on its plane z = height_m: points, and lines with the pixel observed on each.
 
     Attributes:
-        points: (N, 2) m. lines: (2 N + L, 3) two through each point, x = const first, then the segments'.
-        pixels: (2 N + L, 2), as the sight has them.
+        points: (N, 2) m. lines: (2 N + L, 3) two through each point, x = const first, then those of segments.
+        pixels: (2 N + L, 2), in the coordinates of the sight.
     """
 
     height_m: float
@@ -50,12 +51,12 @@ class PlaneSight(Frozen):
 
     @property
     def segments(self) -> int:
-        """Number of the straight lines of which something is seen."""
+        """Number of straight lines with observations."""
         return len(distinct(self.lines[2 * len(self.points) :], axis=0))
 
     @property
     def equations(self) -> int:
-        """What the sight can say of a homography's eight numbers: two for each point, two for each line."""
+        """Number of equations for a homography's eight numbers: two for each point, two for each line."""
         return 2 * len(distinct(self.points, axis=0)) + 2 * self.segments
 
     @property
@@ -66,8 +67,8 @@ class PlaneSight(Frozen):
 
 
 def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
-    """The observations on a plane, by default the one that holds most of them; thinned where there are very many."""
-    most = 1500  # observations of one kind in a sight beyond which a start learns nothing more
+    """The observations on a plane, by default the one with most of them; thinned out if there are very many."""
+    most = 1500  # observations of one kind in a sight: more do not improve the initial estimate
     starts, along = sight.tracks[:, 0], sight.tracks[:, 1]
     level = np.abs(along[:, 2]) < 1e-12
     height = _usual_height(sight, level) if height_m is None else height_m
@@ -88,7 +89,7 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
 
 
 def _usual_height(sight: Sights, level: Mask) -> float:
-    """z at which most of the places and level curves lie, each counted once: 0 where there are none."""
+    """The z at which most of the places and level curves lie, each counted once; 0 where there are none."""
     places = distinct(sight.points.round(9), axis=0)[:, 2]
     tracks = distinct(sight.track_index[level[sight.track_index]])
     heights, votes = np.unique(np.append(places, sight.tracks[tracks, 0, 2].round(9)), return_counts=True)
@@ -115,8 +116,8 @@ _NONE = Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np
 def profile_and_homographies(
     sights: Sights, unit: float, known: RadialProfile | None = None
 ) -> tuple[RadialProfile, Homographies]:
-    """A camera's radial profile, where it is not known, and the homography of each of its sights that determines one;
-    sights about it.
+    """A camera's radial profile, if it is not known, and the homographies of those of its sights that determine one;
+    the sights must be about its principal point.
     """
     pure, board = _flat_sights_of_points(sights)
     rest = np.delete(np.arange(len(sights)), pure)
@@ -129,12 +130,12 @@ def profile_and_homographies(
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].on_arc) and sights[i].on_arc.all():
             ring, matrices[i] = _from_rings(sights[i], unit)
-            if sights[i].key.placement is None:  # a floor, whose z points to the camera
+            if sights[i].key.placement is None:  # a floor's z axis points to the camera
                 matrices[i][:, 1] *= -1.0
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
     lined = [(planes[i].lines, planes[i].pixels) for i in mixed]
-    # Boards in a corner of the image may say nothing of the rest of it.
+    # Boards in a corner of the image may say nothing about the rest of it.
     if known is None and (
         profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined)
     ):
@@ -160,7 +161,7 @@ def _scatter(values: Array, bounds: Indices) -> Array:
 
 
 def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: RadialProfile) -> Homographies:
-    """The homographies of sights of points that send the plane to more than a point or a line."""
+    """The homographies of sights of points, without those that map the plane to a point or a line."""
     matrices = _homographies_of_boards(board, data, profile)
     sizes = np.sqrt(np.trace(_scatter(data.offsets, data.bounds)))
     heights = board.points[board.point_bounds[:-1], 2]
@@ -171,7 +172,9 @@ def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: Radial
 
 
 def _flat_sights_of_points(sights: Sights) -> tuple[Indices, Sights]:
-    """Those that show at least six points of one plane, not on one line, and no curve; by number, and themselves."""
+    """Sights that show at least six points of one plane, not on one line, and no curve: their numbers, and
+    themselves.
+    """
     few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
     candidates = np.flatnonzero(few)
     board = sights.take(candidates)
@@ -182,11 +185,12 @@ def _flat_sights_of_points(sights: Sights) -> tuple[Indices, Sights]:
 
 
 def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialProfile:
-    """By radial alignment on some points of some sights; on all points of these, with more patience, where not all fit.
+    """The profile by radial alignment from some points of some sights; from all points of these, in more rounds, if not
+    all fit.
 
-    A profile needs no more: every other homography follows from it.
+    A profile needs no more sights: all other homographies follow from it.
     """
-    enough_boards = 24  # for a profile
+    enough_boards = 24  # sights that suffice for a profile
     numbers = evenly(len(board), enough_boards)
     rows, sizes = ranges(data.bounds, numbers), np.diff(board.point_bounds)[numbers]
     few = PlaneData(
@@ -202,12 +206,12 @@ def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialPro
 
 
 def _spread_rows(bounds: Indices) -> Indices:
-    """Rows of about as many points of each sight as are enough.
+    """Rows of about `enough_points` points of each sight.
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
     """
     golden = 0.6180339887498949
-    enough_points = 40.0  # of a board
+    enough_points = 40.0  # points of a board that suffice
     sizes = np.diff(bounds)
     order = (np.arange(sizes.max()) * golden) % 1.0
     place = np.arange(bounds[-1]) - np.repeat(bounds[:-1], sizes)
@@ -223,10 +227,11 @@ def _plane_data(board: Sights, rows: Indices) -> PlaneData:
 
 
 def _profile_from_lines(planes: Sequence[tuple[Array, Array]], unit: float) -> RadialProfile:
-    """The profile under which lines are straight and points in place: rank-one closed form, then a shrinking grid.
+    """The profile under which lines are straight and points in place: by a closed form of rank one, then a shrinking
+    grid.
 
     Args:
-        planes: lines (N, 3) of each plane and the offsets (N, 2) px seen on them.
+        planes: lines (N, 3) of each plane, and the offsets (N, 2) px observed on them.
     """
     if not planes:
         return RadialProfile((0.0, 0.0), unit)
@@ -248,7 +253,7 @@ def _profile_from_lines(planes: Sequence[tuple[Array, Array]], unit: float) -> R
 
 
 def _is_lens(c: tuple[float, ...]) -> bool:
-    """Whether a profile looks back nowhere, or hardly."""
+    """Whether a profile hardly looks backwards anywhere."""
     return bool(np.min(1.0 + c[0] * _RADII**2 + c[1] * _RADII**4) >= -0.5)
 
 
@@ -256,15 +261,15 @@ _RADII = np.linspace(0.0, 1.0, 21)
 
 
 def ring_radii(sight: Sights) -> tuple[Array, Array, Array]:
-    """Of rings that a sight about its camera shows: their own centre (2,) px, which need not be the principal point
-    (paper, section 2), and of each observation (M,) its distance from there, px, and the radius of its ring, m.
+    """For rings that a sight about its camera shows: their own centre (2,) px, which need not be the principal point
+    (paper, section 2); and for each observation (M,) its distance from there, px, and the radius of its ring, m.
     """
     on_ring = sight.on_arc
     offsets = sight.curve_pixels[on_ring]
     radii = np.linalg.norm(sight.tracks[sight.track_index[on_ring], 1], axis=1)
     _, ring = np.unique(radii, return_inverse=True)
     centre = offsets.mean(axis=0)
-    for _ in range(10):  # each ring's own mean radius, so that stretches that are not seen do not shift the centre
+    for _ in range(10):  # the mean radius is that of each ring, so that unobserved parts do not shift the centre
         away = offsets - centre
         radius = np.linalg.norm(away, axis=1)
         mean = np.bincount(ring, radius) / np.bincount(ring)
@@ -275,7 +280,7 @@ def ring_radii(sight: Sights) -> tuple[Array, Array, Array]:
 
 def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
     (cx, cy), measured_px, ring_m = ring_radii(sight)
-    if len(distinct(ring_m)) < 3:  # they tell a magnification, and nothing of the lens
+    if len(distinct(ring_m)) < 3:  # these determine only a magnification, and nothing of the lens
         profile, kappa = RadialProfile((0.0, 0.0), unit), float(np.mean(measured_px / ring_m))
     else:
         profile, kappa = ring_profile(measured_px, ring_m, unit)
@@ -283,7 +288,7 @@ def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
 
 
 def _homographies_of_boards(board: Sights, data: PlaneData, profile: RadialProfile) -> Array:
-    """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
+    """The homographies, by LO-RANSAC (pycolmap) for sights in which some points are far off while most fit."""
     homographies, error_px = homographies_of_sights(data, profile)
     limit = max(_SUSPICIOUS * median(error_px), 2.0)
     far = np.add.reduceat(error_px > limit, data.bounds[:-1], dtype=np.int64)
@@ -298,7 +303,7 @@ def _homographies_of_boards(board: Sights, data: PlaneData, profile: RadialProfi
 
 @or_none  # quiet: these points make no homography; the caller keeps the one of all
 def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array | None:
-    """The homography that most points agree on within `limit_px`, by LO-RANSAC (pycolmap), or None.
+    """The homography on which most points agree within `limit_px`, by LO-RANSAC (pycolmap), or None.
 
     Args:
         plane: (N, 2) m. lifted: (N, 3) homogeneous undistorted offsets, px.

@@ -1,9 +1,9 @@
-"""A board of even symmetry that several cameras see at once: labelled the same way in all of them.
+"""Label a symmetric board in the same way in all cameras that see it at once.
 
-A detector cannot tell a board of 4 x 6 corners from the same board turned by half a turn. Before one camera the
-placement takes that up; two cameras then see the board at two places. But they stand as they stand, so the pose of one
-in the other's frame, by way of the board, is the same at every moment once the labels are: the labelling that most
-moments agree on is taken.
+A detector cannot distinguish a board of 4 x 6 corners from the same board turned by half a turn. With one camera, the
+placement absorbs that; two cameras then see the board at two places. But the cameras do not move, so the pose of one in
+the other's frame, computed by way of the board, is the same at every moment if the labels are right. The labelling on
+which most moments agree is taken.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ Both = Mapping[str, tuple[Pose, Pose]]
 
 
 class Labels(Frozen, eq=True):
-    """What was said of the labels.
+    """The result of comparing labels.
 
     Attributes:
-        observations: with the labels that agree. turned: (station, placement) of each board that was labelled anew.
-        open: stations whose labels nothing tells: they share one placement, or poses that either labelling suits.
+        observations: with labels that agree. turned: (station, placement) of each board that was relabelled.
+        open: stations whose labels cannot be decided: they share only one placement, or poses that suit either
+            labelling.
     """
 
     observations: Observations
@@ -37,7 +38,7 @@ class Labels(Frozen, eq=True):
 
 
 def open_words(station: str) -> str:
-    """What to say of an open station."""
+    """The message about a station whose labels cannot be decided."""
     return (
         f"station {station!r}: nothing shows which way round its boards are labelled: show the board to it and to the "
         "first camera at once in more poses, or take a board of odd columns + rows"
@@ -48,7 +49,7 @@ def with_same_labels(observations: Observations) -> Labels:
     """The observations with every symmetric board labelled alike by all stations that see it at a placement.
 
     Raises:
-        DegenerateError: a sight whose pose cannot be told.
+        DegenerateError: the pose of a sight cannot be determined.
     """
     turned, unsaid, labelled = [], [], observations
     for station, turns in _beside_the_first(observations, symmetries):
@@ -61,7 +62,9 @@ def with_same_labels(observations: Observations) -> Labels:
 
 
 def listed_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
-    """Station and placement -> in words, how its points are listed otherwise than those that the first station sees."""
+    """(station, placement) -> how its points are ordered differently from those that the first station sees, in
+    words.
+    """
     # quiet: this only adds a cause to what the user reads
     compared = attempt(lambda: list(_beside_the_first(observations, _listings)))
     return {
@@ -75,11 +78,11 @@ def listed_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
 
 
 def beside_the_first(observations: Observations, boards: Container[str]) -> Iterator[tuple[str, str, Both]]:
-    """The first station that shows some boards, by the names of their targets, where another one shows them, and each
-    that does, with the poses that both have.
+    """The first station that shows some boards, given by the names of their targets, and each other station that shows
+    them at the same placements, with the poses of both.
 
     Raises:
-        CalibrationError: a sight whose pose cannot be told.
+        CalibrationError: the pose of a sight cannot be determined.
     """
     sights = gather_sights(observations)
     shown = {(v.station, v.placement) for v in observations.views if v.placement is not None and v.target in boards}
@@ -98,8 +101,8 @@ def beside_the_first(observations: Observations, boards: Container[str]) -> Iter
 def _beside_the_first(
     observations: Observations, turns_of: Callable[[Target], list[Pose]]
 ) -> Iterator[tuple[str, dict[str, Pose] | None]]:
-    """Stations that see boards with the first one, and by what their sights must be turned, by placement; None where
-    nothing tells.
+    """Stations that see boards with the first one, and the turns that their sights need, by placement; None where they
+    cannot be decided.
     """
     turns = {name: turns_of(target) for name, target in observations.targets.items()}
     target_of = {view.placement: view.target for view in observations.views}
@@ -108,7 +111,7 @@ def _beside_the_first(
 
 
 def symmetries(target: Target) -> list[Pose]:
-    """Turns about a board's middle after which it looks the same, as far as its corners tell; the first is none."""
+    """Turns about a board's middle after which its corners look the same; the first is the identity."""
     grid = target.grid
     if grid is not None and grid.checkered and (grid.columns + grid.rows) % 2 == 1:
         return [Pose.identity()]
@@ -116,7 +119,7 @@ def symmetries(target: Target) -> list[Pose]:
 
 
 def _listings(target: Target) -> list[Pose]:
-    """Turns after which points of a grid lie where others did: those in which its mirrored picture is seen, too."""
+    """Turns after which points of a grid lie where others were, including those that show its mirrored picture."""
     grid = target.grid
     if grid is None:
         return [Pose.identity()]
@@ -128,10 +131,10 @@ def _listings(target: Target) -> list[Pose]:
 
 
 def _turns(both: Both, turns: Sequence[Sequence[Pose]]) -> dict[str, Pose] | None:
-    """By what the second station's sights must be turned, of those that each may be, by placement; None where nothing
-    tells.
+    """The turns, out of those possible, that the second station's sights need, by placement; None where they cannot be
+    decided.
     """
-    alike = 0.15  # of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike
+    alike = 0.15  # difference (rad, and shift over distance) that initial estimates of equal labels may have
     between = [[b @ turn @ a.inverse for turn in own] for (a, b), own in zip(both.values(), turns, strict=True)]
     depth = median(np.array([b.position @ b.position for _, b in both.values()])) ** 0.5
     answers, most = [], max(map(len, turns))
@@ -147,13 +150,13 @@ def _turns(both: Both, turns: Sequence[Sequence[Pose]]) -> dict[str, Pose] | Non
 
 
 def is_clearly_more(off: float, least: float) -> bool:
-    """Whether one of two such distances is out of the question beside the other."""
-    clearly, alike = 3.0, 0.01  # as a factor, and what a start leaves at least
+    """Whether one of two such differences is clearly excluded by the other."""
+    clearly, alike = 3.0, 0.01  # factor that is clear; least difference of two initial estimates
     return off > clearly * max(least, alike)
 
 
 def apart(a: Pose, b: Pose, depth: float) -> float:
-    """Between two poses of a camera: the angle's sine and the shift over a depth."""
+    """The difference between two poses of a camera: the sine of half the angle, plus the shift over a depth."""
     turn = np.linalg.norm(a.rotation - b.rotation) / np.sqrt(8.0)
     return float(turn + np.linalg.norm(a.position - b.position) / depth)
 

@@ -1,7 +1,7 @@
-"""Whether the cameras of a rig show a board at the same moments: names of frames may be exchanged or one off, cameras
-may be out of step while a board moves, and somebody may have turned a camera.
+"""Test whether the cameras of a rig show a board at the same moments. Names of frames may be exchanged or off by one,
+cameras may be out of step while a board moves, or somebody may have turned a camera.
 
-A camera shows by itself where a board is. At one moment that is where the others see it, but for the noise.
+Each camera by itself shows where a board is. At the same moment, the others must see it there, up to the noise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ceres_cal.problem import Estimate, Problem
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.start.same_labels import Both, apart, beside_the_first, is_clearly_more, listed_otherwise
 
-_FEWEST = 4  # moments that say how cameras stand: of three, two agree by chance
+_FEWEST = 4  # moments from which on the cameras can be compared: of three, two agree by chance
 _ADVICE = (
     "they are not of the same moment, or a camera was moved: take all of them at once, hold the board still meanwhile, "
     "or leave frames that several cameras show to one of them"
@@ -25,13 +25,14 @@ _ADVICE = (
 
 
 def require_same_moments(problem: Problem, estimate: Estimate) -> str:
-    """A warning where cameras contradict one another about most boards by more than their noise, "" where they do not.
+    """A warning where cameras contradict one another about most boards by more than their noise; "" if they do not.
 
     Raises:
         SolutionError: they do by so much that nothing that they show together can be used.
     """
-    # Times the noise. Beside boards that moved by 0.3 mm between two shutters, 0.5 to 1.1 times, the numbers of the
-    # cameras are within what is stated; beside 1 mm, 1.8 to 9 times, they were thousands of standard deviations off.
+    # Ratios to the noise. Beside boards that moved by 0.3 mm between two shutters, 0.5 to 1.1 times the noise, the
+    # numbers of the cameras are within their uncertainty; beside 1 mm, 1.8 to 9 times, they were thousands of standard
+    # deviations off.
     named, refused = 1.0, 1.5
     shares = _by_own_poses(problem, estimate)
     if len(shares) < _FEWEST:
@@ -48,8 +49,8 @@ def require_same_moments(problem: Problem, estimate: Estimate) -> str:
 
 
 def _by_own_poses(problem: Problem, estimate: Estimate) -> dict[str, float]:
-    """Placement that several sights show -> share of the squared residuals of one of them that a pose of its own would
-    explain, of the one that it explains most of. None where a field says where cameras stand: it may be wrong.
+    """Placement that several sights show -> the largest share of the squared residuals of one of these sights that a
+    pose of its own would explain. Empty where a field shows where cameras stand: the field may be wrong.
     """
     sights, alone = problem.sights, problem.sights.seen_once
     shared = [n for n, key in enumerate(sights.keys) if key.placement not in (None, *alone)]
@@ -67,8 +68,8 @@ def _by_own_poses(problem: Problem, estimate: Estimate) -> dict[str, float]:
 
 
 def shifted(observations: Observations) -> Iterator[str]:
-    """In words, of each station whose frames suit those of the first one by another count."""
-    alike = 0.15  # what a start leaves of poses that are the same, see `same_labels`
+    """In words, each station whose frames match those of the first one after a shift."""
+    alike = 0.15  # difference that initial estimates of equal poses may have, see `same_labels`
     for moments in _moments(observations):
         costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
         best = min(costs, key=costs.__getitem__)
@@ -81,7 +82,7 @@ def shifted(observations: Observations) -> Iterator[str]:
 
 
 def told_apart(observations: Observations) -> Iterator[str]:
-    """In words, why stations may contradict one another: their frames, or how they list points of boards."""
+    """In words, why stations may contradict one another: their frames, or the order of boards' points."""
     yield from shifted(observations)
     if every := listed_otherwise(observations):
         (station, placement), words = next(iter(every.items()))
@@ -90,8 +91,8 @@ def told_apart(observations: Observations) -> Iterator[str]:
 
 
 def shown_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
-    """Station and placement -> what to do where the other camera sees the board there otherwise, at another placement
-    or with its points in another order.
+    """(station, placement) -> advice where another camera sees the board differently: at another placement, or with its
+    points in another order.
     """
     found = listed_otherwise(observations)
     for moments in _moments(observations):
@@ -101,14 +102,14 @@ def shown_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
 
 
 class _Moments:
-    """Two stations, and where both see boards by themselves, moment by moment."""
+    """Two stations, with the poses of boards by each of them, moment by moment."""
 
     def __init__(self, first: str, second: str, poses: Both) -> None:
-        most = 40  # in a row, of which all are compared with all, by all shifts
+        most = 40  # moments used, since all are compared with all, for all shifts
         self.first, self.second, self._names = first, second, list(poses)[:most]
         seen = [poses[name] for name in self._names]
         self._depth = median(np.array([np.linalg.norm(b.position) for _, b in seen]))
-        # Where the second camera stands before the first, by what they show at moments i and j.
+        # Pose of the second camera in the first one's frame, from what they show at moments i and j.
         self._between = [[b @ a.inverse for _, b in seen] for a, _ in seen]
 
     @property
@@ -122,23 +123,23 @@ class _Moments:
         return [self._between[i][i + shift] for i in range(len(self._names)) if 0 <= i + shift < len(self._names)]
 
     def _off(self, shift: int) -> Array:
-        """(N, N) by how much all moments disagree about where the cameras stand."""
+        """(N, N) differences of the cameras' relative pose between all moments."""
         poses = self._at(shift)
         return np.array([[self._apart(one, other) for other in poses] for one in poses])
 
     def cost(self, shift: int) -> float:
-        """By how much most moments disagree at least, infinite of too few."""
+        """The median difference from the moment that agrees best with the others; infinite for too few moments."""
         off = self._off(shift)
         return float(np.min(np.median(off, axis=1))) if len(off) >= _FEWEST else np.inf
 
     def exchanged(self) -> Iterator[tuple[tuple[str, str], str]]:
-        """The second station's placements that suit others of the first, and which."""
+        """The second station's placements that match others of the first, and these."""
         off = self._off(0)
         likeliest, usual = self._at(0)[int(np.argmin(np.median(off, axis=1)))], self.cost(0)
         suits = np.array([[self._apart(one, likeliest) for one in row] for row in self._between])
         for number, name in enumerate(self._names):
             best = int(np.argmin(suits[:, number]))
-            # As well as the others do, or it is something else: labels that are turned suit another frame by chance.
+            # It must match as well as the others do: wrongly turned labels match another frame by chance.
             as_well = not is_clearly_more(suits[best, number], usual)
             if as_well and is_clearly_more(suits[number, number], suits[best, number]):
                 yield (self.second, name), self._names[best]
@@ -146,7 +147,7 @@ class _Moments:
 
 
 def _moments(observations: Observations) -> list[_Moments]:
-    """Of the first station and each other that sees boards with it."""
+    """The comparison of the first station with each other station that sees boards with it."""
     # quiet: this only adds a cause to what the user reads of it
     pairs = attempt(lambda: list(beside_the_first(observations, observations.targets)))
     several = [] if isinstance(pairs, CalibrationError) else pairs

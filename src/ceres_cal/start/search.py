@@ -1,12 +1,12 @@
-"""One search for where a camera stands and what its phi is: by all that one sight shows, whatever that is.
+"""Search for a camera's pose and phi from everything that one sight shows.
 
-Cameras that may be are drawn: those that closed forms propose, those that four points or lines of a floor make by
-themselves (a wrong label spoils few of them), and a grid of rotations and of phi, whose positions are linear in what is
-seen. All are scored by the same robust cost of the same distances in px, the best brought to their minima by damped
-Gauss-Newton steps, and what costs no more than the least one by chance is kept beside it.
+Candidates are cameras that closed forms propose, cameras from minimal sets of four points or lines of a floor (a wrong
+label spoils few of them), and a grid of rotations and phi, for which the position is linear in the observations. All
+are judged by the same robust cost of the same distances in px. The best are brought to their minima by damped
+Gauss-Newton steps. Candidates that cost no more than the best, within chance, are kept beside it.
 
-A point P of the floor seen at p is p x H P = 0, a line l seen as l' is l x H^T l' = 0: two equations each for the eight
-numbers of the homography H. Of H follow phi, by r1 . r2 = 0 and |r1| = |r2|, and the pose.
+A point P of the floor seen at p gives p x H P = 0, a line l seen as l' gives l x H^T l' = 0: two equations each for the
+eight numbers of the homography H. From H follow phi, by r1 . r2 = 0 and |r1| = |r2|, and the pose.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
 _TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
 _AZIMUTHS, _ROLLS = (1, 6, 11, 15, 18, 18), 18
 _FIRST_STEPS, _STEPS, _LAST_STEPS = 6, 12, 20
-_ROUGH_PX = 2.0  # scale of a search's first rounds
+_ROUGH_PX = 2.0  # scale of the residuals in the first rounds of a search
 _DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
 
 
@@ -42,7 +42,7 @@ class BestCameras(Frozen):
 
 
 def information(lines: Sightlines, pose: Candidates, scale_px: float) -> Array:
-    """(8, 8) what is known of one camera's numbers by rows that fit it, and beforehand; 0 of those that are held."""
+    """(8, 8) information on one camera's numbers, from rows that fit it and the prior; 0 for held numbers."""
     r, derivatives = lines.equations(pose)
     weights = 1.0 / (scale_px**2 * (1.0 + (r[0] / (2.0 * scale_px)) ** 2) ** 2)
     matrix = (derivatives[0] * weights) @ derivatives[0].T
@@ -52,8 +52,8 @@ def information(lines: Sightlines, pose: Candidates, scale_px: float) -> Array:
 
 
 def refined(lines: Sightlines, poses: Candidates, steps: int, most_px: float = np.inf) -> Candidates:
-    """Each brought towards its minimum, at the scale of its own residuals, at most so many px."""
-    nothing = 1e-3  # variances: who gains less is there
+    """Move each candidate towards its minimum, at the scale of its own residuals but at most `most_px`."""
+    nothing = 1e-3  # gain, in variances, below which a candidate has converged
     if not len(poses):
         return poses
     damping = np.full(len(poses), _DAMPING)
@@ -76,8 +76,8 @@ def refined(lines: Sightlines, poses: Candidates, steps: int, most_px: float = n
 
 
 def _step(lines: Sightlines, at: tuple[Array, Array], poses: Candidates, scale: Array, damping: Array) -> Array:
-    """(K, 8) a damped Gauss-Newton step of each, reweighted against what does not fit."""
-    most_step = 0.3  # rad, and of log phi
+    """(K, 8) damped Gauss-Newton steps, reweighted against rows that do not fit."""
+    most_step = 0.3  # largest turn (rad) and change of log phi in a step
     r, derivatives = at
     free = np.flatnonzero(~lines.known.held)
     weights = lines.weight / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
@@ -107,7 +107,9 @@ def _bounded(vectors: Array, most: float) -> Array:
 
 
 def scales(r: Array, share: Array, free: int) -> Array:
-    """(K, 1) px: the middle of the residuals (K, N) that so many numbers cannot take up; each counts by its share."""
+    """(K, 1) px: the weighted median of residuals (K, N), beyond those that `free` numbers can fit; `share`:
+    weights.
+    """
     rounding = 1e-9
     order = np.argsort(np.abs(r), axis=1)
     sums = np.cumsum(np.take_along_axis(np.broadcast_to(share, r.shape), order, 1), axis=1)
@@ -123,22 +125,22 @@ def _cost(lines: Sightlines, r: Array, poses: Candidates, scale: Array | float) 
 
 
 def _possible(lines: Sightlines, poses: Candidates) -> Mask:
-    """(K,) whether a camera stands over what it sees, with a phi that lenses have."""
-    widest = 2.7  # of log phi from the middle: from a fisheye to a telescope
-    lowest = 0.01  # of the extent of what is seen: a camera that lies on a line sees it everywhere
+    """(K,) whether a camera stands above what it sees, with a phi that lenses have."""
+    widest = 2.7  # difference of log phi from the middle: from a fisheye to a telescope
+    lowest = 0.01  # least height over the extent of what is seen: a camera that lies on a line sees it everywhere
     floor, reach = float(lines.places[:, 2].min()), float(np.ptp(lines.places, axis=0).max())
     is_lens = np.abs(poses.log_phi - lines.known.log_phi[0]) < widest
     return np.asarray(is_lens & (poses.positions[:, 2] > floor + lowest * reach))
 
 
 def judged(lines: Sightlines, poses: Candidates, least_px: float) -> tuple[Array, Array]:
-    """Costs (K,), minus twice the logarithm of the likelihood of Cauchy errors, each camera's at the scale (K, 1) px of
-    its own residuals, at least so many px; with what is seen where it cannot be.
+    """Costs (K,), minus twice the log likelihood of Cauchy errors, each at the scale (K, 1) px of the candidate's own
+    residuals, which is at least `least_px`; rows in impossible places cost more.
 
-    A curve's label is right, or it is wrong, which is unlikely, and all of its rows then say no more than its numbers;
-    the scale is that of the rest.
+    A curve's label is right; or it is wrong, which is unlikely, and all of its rows then count only as much as the
+    numbers that it determines. The scale is that of the other rows.
     """
-    behind = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
+    behind = 20.0  # residual, in scales, of a row that is seen behind the camera or beyond the ends of its line
     far_px = 1e6
     r = np.nan_to_num(lines.distances(poses), nan=far_px, posinf=far_px, neginf=-far_px)
     free = int(np.count_nonzero(~lines.known.held))
@@ -151,8 +153,8 @@ def judged(lines: Sightlines, poses: Candidates, least_px: float) -> tuple[Array
 
 
 def _by_labels(lines: Sightlines, r: Array, scale: Array) -> tuple[Array, Mask]:
-    """Costs (K,) of residuals (K, N), and which are of curves whose labels are rather wrong."""
-    wrong_label = 25.0  # variances that a wrong label costs by itself
+    """Costs (K,) of residuals (K, N), and a mask of the rows of curves whose labels are likely wrong."""
+    wrong_label = 25.0  # cost of a wrong label, in variances
     rows = 4.0 * np.log1p((r / (2.0 * scale)) ** 2) + 4.0 * np.log(scale)
     first, wrong = lines.groups, np.zeros(r.shape, dtype=bool)
     if not len(first):
@@ -164,18 +166,18 @@ def _by_labels(lines: Sightlines, r: Array, scale: Array) -> tuple[Array, Mask]:
 
 
 def costs(lines: Sightlines, poses: Candidates, least_px: float) -> Array:
-    """(K,) of `judged`."""
+    """(K,) costs of `judged`."""
     return judged(lines, poses, least_px)[0]
 
 
 def searched(lines: Sightlines, few: Sightlines, proposed: Candidates | None = None) -> BestCameras:
-    """The best cameras of those proposed and of a grid.
+    """The best cameras of the proposed ones, of minimal sets and of a grid.
 
     Args:
         few: some of the rows, for the first rounds.
     """
-    near = 0.02  # rad, and of the height: as near, cameras are on the way to one minimum
-    first, then = 64, 20  # cameras that take the first steps, then the rest
+    near = 0.02  # rad, and share of the height: nearer candidates are on the way to the same minimum
+    first, then = 64, 20  # numbers of candidates that are refined first, and further
     proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, lines.known.least_px)
     some = _drawn(few)
     some = some.take(np.argsort(costs(few, some, 8.0 * rough_px))[:first])
@@ -188,7 +190,7 @@ def searched(lines: Sightlines, few: Sightlines, proposed: Candidates | None = N
 
 
 def best_of(lines: Sightlines, some: Candidates) -> BestCameras:
-    """The best of them, brought to their minima."""
+    """The best of some candidates, brought to their minima."""
     some = refined(lines, some, _LAST_STEPS)
     cost, scale = judged(lines, some, lines.known.least_px)
     order = np.argsort(cost)
@@ -196,10 +198,10 @@ def best_of(lines: Sightlines, some: Candidates) -> BestCameras:
 
 
 def apart(poses: Candidates, costs: Array, least: float) -> Indices:
-    """(n,) numbers of those that stand elsewhere than each one that costs less, the least first.
+    """(n,) numbers of candidates that differ in place from each one with a lower cost, the lowest first.
 
     Args:
-        least: rad by which, or share of the height by which, places are apart.
+        least: least difference, in rad for rotations, or as a share of the height for positions.
     """
     kept: list[int] = []
     height = np.maximum(np.abs(poses.positions[:, 2]), 1e-9)
@@ -212,7 +214,7 @@ def apart(poses: Candidates, costs: Array, least: float) -> Indices:
 
 
 def _logs(known: CameraPrior, grid: Array) -> Array:
-    """Logarithms of phi to try, of a grid in half image diagonals; one where phi is told."""
+    """Values of log phi to try, from a grid in half image diagonals; only one where phi is known."""
     middle, sd = known.log_phi
     return middle + np.log(grid) - np.log(1.1) if sd > 0.2 else np.array([middle])
 
@@ -223,7 +225,7 @@ def _drawn(few: Sightlines) -> Candidates:
     rotations = np.tile(_grid(), (len(logs), 1, 1))
     log_phi = np.repeat(logs, len(_grid()))
     positions, floor = few.positions(rotations, log_phi), float(few.places[:, 2].min())
-    positions[:, 2] = floor + np.abs(positions[:, 2] - floor)  # a camera under it is the mirror image of one above
+    positions[:, 2] = floor + np.abs(positions[:, 2] - floor)  # a camera under the floor is mirrored to above it
     return Candidates(rotations, positions, log_phi, np.zeros(len(log_phi)))
 
 
@@ -244,12 +246,12 @@ def _grid() -> Array:
 
 
 def minimal_sets(lines: Sightlines, log_phi: Array) -> Candidates:
-    """Cameras by four points or lines of the floor each.
+    """Cameras from sets of four points or lines of the floor.
 
     Args:
-        log_phi: (P,) among which that of each is chosen.
+        log_phi: (P,) values from which that of each camera is chosen.
     """
-    second = 1e-4  # of the greatest singular value: where the second least is smaller, the four make no homography
+    second = 1e-4  # ratio of the second least to the largest singular value, below which four make no homography
     floor, image, is_line = _elements(lines)
     if len(floor) < 4:
         return Candidates.none()
@@ -284,14 +286,14 @@ def _cameras(matrices: Array, lines: Sightlines, log_phi: Array) -> Candidates:
 
 
 def _floor(lines: Sightlines) -> float:
-    """z at which most rows lie."""
+    """The z at which most rows lie."""
     heights, votes = np.unique(lines.places[:, 2].round(9), return_counts=True)
     return float(heights[np.argmax(votes)])
 
 
 def _elements(lines: Sightlines) -> tuple[Array, Array, Mask]:
-    """Points and straight lines of the floor (E, 3), as they are seen (E, 3), and which are lines (E,)."""
-    spread = 1e-6  # of an image line's rows, below which they are one place
+    """Points and straight lines of the floor (E, 3), their images (E, 3), and which are lines (E,)."""
+    spread = 1e-6  # relative spread of the rows of an image line, below which they are one place
     level = 1e-9
     height, seen = _floor(lines), np.column_stack([lines.pixels, lines.w])
     floor, image, is_line = [], [], []
@@ -316,20 +318,20 @@ def _elements(lines: Sightlines) -> tuple[Array, Array, Mask]:
 
 
 def _equations(floor: Array, image: Array, is_line: Mask, to_floor: Array, to_image: Array) -> Array:
-    """(E, 3, 9) rows of each point or line, of rank two, in H from scaled places to scaled pixels."""
-    # a line l becomes T^-T l where its points become T p
+    """(E, 3, 9) rows of each point or line, of rank two, for H from scaled places to scaled pixels."""
+    # A line l becomes T^-T l if points become T p.
     f = np.where(is_line[:, None], floor @ np.linalg.inv(to_floor), floor @ to_floor)
     p = np.where(is_line[:, None], image @ np.linalg.inv(to_image), image @ to_image)
     f, p = f / np.linalg.norm(f, axis=1, keepdims=True), p / np.linalg.norm(p, axis=1, keepdims=True)
-    # of a point [p]x H f, whose rows are sums of p_i H_jk f_k; of a line [f]x H^T p
+    # For a point: [p]x H f, whose rows are sums of p_i H_jk f_k; for a line: [f]x H^T p.
     of_point = np.einsum("eij,ek->eijk", skews(p), f)
     of_line = np.einsum("eik,ej->eijk", skews(f), p)
     return np.asarray(np.where(is_line[:, None, None, None], of_line, of_point).reshape(len(f), 3, 9))
 
 
 def _sets_of_four(count: int) -> Indices:
-    """(S, 4) sets of four of so many: all, or some at random, alike in every run."""
-    few_elements, most_sets = 9, 120  # of so few all sets of four are taken, else so many at random
+    """(S, 4) sets of four out of `count`: all of them, or some at random, the same in every run."""
+    few_elements, most_sets = 9, 120  # elements of which all sets of four are taken, and number of sets of more
     if count <= few_elements:
         return np.array(list(combinations(range(count), 4)), dtype=np.int64)
     rng = np.random.default_rng(0)

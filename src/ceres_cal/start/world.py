@@ -1,6 +1,6 @@
-"""Where a camera stands by one sight of the world: what the homography proposes where it holds, else by a search.
+"""Find where a camera stands from one sight of the world: by the homography's proposal if it holds, else by a search.
 
-Poses of sights become stations and placements.
+Also chain the poses of sights into stations and placements.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import BestCameras, apart, best_of, information, searched
 from ceres_cal.start.sightlines import CameraPrior, Candidates, Sightlines
 
-_MOST = (20, 12)  # points, and places of each curve, by which a camera is searched for
-_HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
-_SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
-_ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
-_LEFT_OVER = 8  # equations beyond the unknowns: with fewer another place may explain them as well
-_TOLD = 0.05  # standard deviation of log phi below which a sight tells it: above, the start is called a guess
-_OPEN = 1e-10  # least eigenvalue of the information in its own units: rounding is less, the weakest scenes have 1e-7
-_ALIKE = 30.0  # variances by which another place may cost more at a start: the solve, which is exact, decides
-_APART = 0.05  # rad, and of the height: places that are nearer are one minimum
+_MOST = (20, 12)  # points of a sight, and places of each curve, that a search for a camera uses
+_HOLDS = 0.7  # share of rows that must be near for a place to hold: a fifth and more, of any features, may be wrong
+_SCALES = 8.0  # scales of the residuals within which a row is near: no clean row is farther
+_ROUGH = 0.01  # of the half diagonal, beyond which no row is near: at a wrong place the scale is large
+_LEFT_OVER = 8  # degrees of freedom for a place to hold: with fewer, another place may explain the rows as well
+_TOLD = 0.05  # standard deviation of log phi up to which a sight determines phi: above, the start is called a guess
+_OPEN = 1e-10  # least eigenvalue of the normalised information: rounding is less, the weakest scenes have 1e-7
+_ALIKE = 30.0  # variances by which the cost of another place may be higher: the solve, which is exact, decides
+_APART = 0.05  # rad, and share of the height: places that are nearer than this are one minimum
 _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")
 
 
 class CameraPlace(Frozen):
-    """Where a camera stands, by one sight.
+    """The place of a camera, from one sight.
 
     Attributes:
-        pose: cam_from_world (3, 4). phi: px. profile: of the lens that shows it from there.
+        pose: cam_from_world (3, 4). phi: px. profile: of the lens under which the sight is seen from there.
     """
 
     pose: Array
@@ -43,10 +43,10 @@ class CameraPlace(Frozen):
 
 
 class CameraPlaces(Frozen):
-    """The places that a sight may be seen from, the likeliest first.
+    """The possible places of a camera, from one sight, the likeliest first.
 
     Attributes:
-        open: numbers that the sight leaves open, by name. tells_phi: whether it tells phi.
+        open: names of the numbers that the sight leaves undetermined. tells_phi: whether it determines phi.
     """
 
     places: tuple[CameraPlace, ...]
@@ -55,8 +55,8 @@ class CameraPlaces(Frozen):
 
 
 def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float]) -> CameraPrior:
-    """What is stated of a station's place, and this of phi."""
-    least_sd = 1e-3  # of a stated number, as a share: a start is no better
+    """The prior of a search: what is stated of a station's place, and mean and sd of log phi."""
+    least_sd = 1e-3  # relative, of a stated number: an initial estimate is no more accurate
     position, sd = np.zeros(3), np.full(3, np.inf)
     for prior in priors:
         if prior.owner == "station" and prior.name == station and prior.quantity in ("height_m", "position_m"):
@@ -76,25 +76,25 @@ def placed(
     may_bend: bool,
     may_search: bool = True,
 ) -> CameraPlaces:
-    """The places of a camera by one sight about it.
+    """The possible places of a camera by one sight about its principal point.
 
     Args:
-        proposed: cam_from_world (3, 4) of a homography at this log phi, where there is one.
-        may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
-        may_search: whether a camera is searched for where what is proposed does not hold.
+        proposed: cam_from_world (3, 4) of a homography at this log phi, if there is one.
+        may_bend: whether the profile may be changed: where nothing holds, wrong labels may have determined it.
+        may_search: whether a camera is searched for where the proposal does not hold.
 
     Raises:
         InputError: only a mirrored picture of the floor holds.
-        SolutionError: nothing holds, and none is searched for.
+        SolutionError: nothing holds, and no search is made.
     """
-    bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
+    bend_sd = 0.15  # sd of the bend at the image's corner for an unknown lens; more is a fisheye, which lines show
     lines = _lines_of(sight, profile, known, _rows_of(sight))
     given = Candidates.none()
     if proposed is not None and np.all(np.isfinite(proposed)):
         given = _candidate(proposed, log_phi)
         found = best_of(lines, given)
         if holds(lines, found):
-            if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
+            if known.held[6]:  # other sights determine phi and lens: their homography is as accurate as this sight
                 return _answered(lines, profile, replace(found, poses=given, costs=found.costs[:1]))
             return _answered(*_at_rest(sight, lines, profile, found))
     if not may_search:
@@ -121,11 +121,12 @@ def placed(
 def _at_rest(
     sight: Sights, lines: Sightlines, profile: RadialProfile, found: BestCameras
 ) -> tuple[Sightlines, RadialProfile, BestCameras]:
-    """The best places and what fits alike, by nearly all rows of a sight in place of some."""
-    most_places = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
+    """The best places and those that fit as well, refined by nearly all rows of a sight instead of some."""
+    most_places = 5  # that are returned: a valley has as many as were tried, and the solve follows it from any of them
     alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
-    # By these or other twelve places of a curve a wide lens' field was found or lost, and phi was told or guessed.
-    times = 16  # as many as it is searched for by
+    # Depending on which twelve places of a curve were used, a wide lens' field was found or lost, and phi was
+    # determined or a guess.
+    times = 16  # ratio of the rows used here to those used in the search
     every = _lines_of(sight, profile, lines.known, _rows_of(sight, (times * _MOST[0], times * _MOST[1])))
     return every, profile, best_of(every, found.poses.take(np.array(alike[:most_places])))
 
@@ -133,7 +134,7 @@ def _at_rest(
 def _searched(
     sight: Sights, profile: RadialProfile, known: CameraPrior, given: Candidates, axes: tuple[float, float]
 ) -> tuple[Sightlines, RadialProfile, BestCameras]:
-    """`axes`: which way the picture's x and y point."""
+    """Search for a camera. `axes`: signs of the picture's x and y, -1 for a mirrored picture."""
     few = 8, 4  # points, and places of each curve, for the first rounds of a search
     every = (_lines_of(sight, profile, known, _rows_of(sight, most)) for most in (_MOST, few))
     lines, some = (replace(one, pixels=one.pixels * axes) for one in every)
@@ -141,8 +142,8 @@ def _searched(
 
 
 def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> CameraPlaces:
-    """With what the best place leaves open, and the others that fit alike."""
-    finest_px = 1e-2  # of a scale: exact data are told no better
+    """The answer: the places found, and what the best of them leaves undetermined."""
+    finest_px = 1e-2  # least scale: exact data determine numbers no better
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, finest_px)
     matrix = information(lines, best, scale)
     places = tuple(_place(found.poses, number, profile) for number in apart(found.poses, found.costs, _APART))
@@ -150,7 +151,7 @@ def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> 
 
 
 def holds(lines: Sightlines, found: BestCameras) -> bool:
-    """Whether nearly all of what is seen agrees with a place, and more than any place would take up."""
+    """Whether nearly all rows agree with the best place, and they are more than any place could fit."""
     best = found.poses.take(np.array([0]))
     distance = np.abs(lines.distances(best)[0])
     limit = min(_SCALES * found.scale_px, _ROUGH * lines.unit_px) + 1e-3
@@ -159,7 +160,7 @@ def holds(lines: Sightlines, found: BestCameras) -> bool:
 
 
 def open_numbers(matrix: Array) -> tuple[str, ...]:
-    """Names of the numbers that an information matrix (8, 8) leaves open; those that are held have no row."""
+    """Names of the numbers that an information matrix (8, 8) leaves undetermined; held numbers have zero rows."""
     free, sizes, values, vectors = _decomposed(matrix)
     missing = [_NAMES[n] for n in range(6) if n not in free]
     lost = vectors[:, values < _OPEN * max(values[-1], 1e-300)] / sizes[:, None] if len(free) else np.empty((0, 0))
@@ -169,14 +170,14 @@ def open_numbers(matrix: Array) -> tuple[str, ...]:
 
 
 def _decomposed(matrix: Array) -> tuple[Indices, Array, Array, Array]:
-    """Which numbers of an information matrix are free, their sizes, and eigenvalues and vectors in these."""
+    """The free numbers of an information matrix, their sizes, and eigenvalues and eigenvectors in units of these."""
     free = np.flatnonzero(np.diag(matrix) > 0.0)
     sizes = np.sqrt(np.diag(matrix)[free])
     return free, sizes, *np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
 
 
 def _sd_of(matrix: Array, number: int) -> float:
-    """Standard deviation of one number, infinite where it is open; 0 where it is held."""
+    """Standard deviation of one number; infinite where it is undetermined, 0 where it is held."""
     free, sizes, values, vectors = _decomposed(matrix)
     if number not in free:
         return 0.0
@@ -186,8 +187,8 @@ def _sd_of(matrix: Array, number: int) -> float:
 
 
 def left_of(sight: Sights, place: CameraPlace) -> Array:
-    """(2 N + M,) how far from its place or curve all that a sight shows is seen, in stated sigmas; infinite where it
-    cannot be. What no lens of the options follows is not in it.
+    """(2 N + M,) distances, in stated sigmas, of all rows of a sight from where they should be seen; infinite where
+    they cannot be seen. The profile is the one found, whatever lenses the options allow.
     """
     points, some = chosen = _rows_of(sight, (len(sight.points), len(sight.on_arc)))
     log_phi = float(np.log(place.phi))
@@ -198,7 +199,7 @@ def left_of(sight: Sights, place: CameraPlace) -> Array:
 
 
 def _candidate(pose: Array, log_phi: float) -> Candidates:
-    """The one camera at cam_from_world (3, 4)."""
+    """The candidate with one camera at cam_from_world (3, 4)."""
     rotation = pose[:, :3].T
     return Candidates(rotation[None], (-rotation @ pose[:, 3])[None], np.array([log_phi]), np.zeros(1))
 
@@ -210,7 +211,7 @@ def _place(poses: Candidates, number: int, profile: RadialProfile) -> CameraPlac
 
 
 def _rows_of(sight: Sights, most: tuple[int, int] = _MOST) -> tuple[Indices, Indices]:
-    """Numbers of some points of a sight and of some places of each of its curves, evenly, those of arcs last."""
+    """Numbers of some points of a sight and of some places of each of its curves, evenly, with those of arcs last."""
     points = evenly(len(sight.points), most[0])
     every = (np.flatnonzero(sight.track_index == track) for track in distinct(sight.track_index))
     some = np.concatenate([np.empty(0, np.int64), *(own[evenly(len(own), most[1])] for own in every)])
@@ -218,7 +219,7 @@ def _rows_of(sight: Sights, most: tuple[int, int] = _MOST) -> tuple[Indices, Ind
 
 
 def _lines_of(sight: Sights, profile: RadialProfile, known: CameraPrior, chosen: tuple[Indices, Indices]) -> Sightlines:
-    """Of the chosen rows, see `_rows_of`."""
+    """The sight lines of the chosen rows, see `_rows_of`."""
     (points, some), tracks = chosen, sight.track_index
     arcs = int(np.count_nonzero(sight.on_arc[some]))
     starts, along = sight.tracks[tracks[some], 0], sight.tracks[tracks[some], 1].copy()
@@ -241,7 +242,7 @@ def _lines_of(sight: Sights, profile: RadialProfile, known: CameraPrior, chosen:
 
 
 _STATED = {"x": "position_m", "y": "position_m", "height": "height_m", "phi": "phi"}
-"""What an open number may be stated as."""
+"""Names of the priors by which an undetermined number may be stated."""
 
 
 def chained_poses(
@@ -251,14 +252,15 @@ def chained_poses(
     standing: Mapping[str, Station] | None = None,
     open_numbers: Mapping[int, tuple[str, ...]] | None = None,
 ) -> tuple[dict[str, Station], Poses]:
-    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known.
+    """Chain the poses (K, 3, 4) of sights into stations and placements: the best-seen first, each extending the known
+    ones.
 
     Args:
-        numbers: (K,) of these sights. standing: stations whose place is known. open_numbers: what other sights leave
-            open, by their numbers.
+        numbers: (K,) of these sights. standing: stations whose pose is known. open_numbers: what other sights leave
+            undetermined, by their numbers.
 
     Raises:
-        DegenerateError: naming a sight that nothing places.
+        DegenerateError: it names a sight that is connected with nothing.
     """
     sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
     order = np.argsort(-sizes[numbers], kind="stable")
@@ -295,7 +297,7 @@ def chained_poses(
 
 
 def _what_poses(sight: Sights) -> str:
-    """What to do where no pose of a sight is found."""
+    """The advice where no pose of a sight is found."""
     if len(sight.points) > 3 and np.linalg.matrix_rank(sight.points - sight.points[0]) > 1:
         return "none shows its points through this lens: check its labels, try another lens"
     return "give at least four points, not on one line, or straight lines in two directions, two of each"
