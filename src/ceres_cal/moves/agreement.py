@@ -1,7 +1,7 @@
-"""Does a calibration hold? The answer that `check`, `score`, `audit` and `compare` give, and what they share.
+"""Does a calibration hold? The answer that `check`, `score`, `audit` and `compare` give, and their common parts.
 
-Each of them holds a calibration against something else, observations or another calibration, and says of every
-station, camera or view: what differs, whether chance explains it, and what does.
+Each of them compares a calibration with something else, observations or another calibration. For every station, camera
+or view they say what differs, whether chance explains the difference, and otherwise what does.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from ceres_cal.posterior import ErrorMap, FieldGrid, field_grid, visible_pixels
 from ceres_cal.problem import Estimate, Information, Key
 from ceres_cal.scene import Camera, Target
 
-# How often a calibration that holds is said not to, where nobody states another rate. At half of it nothing changes, at
-# double one of six pairs of calibrations of one camera differs.
+# Rate at which a calibration that holds is reported not to, unless the user states another rate. At half of it nothing
+# changes; at double one of six pairs of calibrations of one camera differs.
 FALSE_ALARMS = 0.01
-# Times the noise of the old calibration, from where on the lens is doubted. Below 1 nothing is quiet enough to be
-# named; at double nothing changes.
+# Factor on the old calibration's noise above which the lens is doubted. Below 1 no explanation has little enough noise
+# to be named; at double nothing changes.
 NOISIER = 1.5
-# Nats that a number which has not changed gains in one case of 100: 2.58 standard deviations. Of 60 refits to five
-# clicks of a camera that stands still 3 say that its lens has changed, where a click is a stray; at half of it 10, at
-# double 1, without it 21.
+# Nats that an unchanged number gains in one case of 100: 2.58 standard deviations. Of 60 refits to five clicks of a
+# camera that stands still, where one click is a stray, 3 say that its lens has changed; at half of it 10, at double 1,
+# without it 21.
 _SEEN_NATS = 0.5 * 2.576**2
 
 
 class FieldDifference(ErrorMap):
-    """Where two cameras locate the same pixels, over the field.
+    """The difference between the places where two cameras locate the same pixels, over the field.
 
     Attributes:
-        difference_mm: (Y, X, 2) where the second locates what the first sees there, less the place itself; NaN where
-            the first does not show it. lost: (Y, X) where the second has no answer although the first shows the place.
-        expected_mm: (Y, X) standard deviation of its length where nothing but noise lies between them; NaN where that
-            cannot be said.
+        difference_mm: (Y, X, 2) place where the second camera locates the pixel at which the first shows a place, minus
+            that place; NaN where the first does not show it. lost: (Y, X) where the second has no answer although the
+            first shows the place.
+        expected_mm: (Y, X) standard deviation of its length if they differ by noise only; NaN where unknown.
     """
 
     difference_mm: Array
@@ -71,11 +71,11 @@ class FieldDifference(ErrorMap):
 
 
 class MapChange(Frozen):
-    """A station from one camera to another.
+    """The change of a station from one camera to another.
 
     Attributes:
-        moved_mm, turned_deg: of its pose; how far is NaN where that is not known. phi_px: of both.
-        shift_px: root mean square shift of the picture over the first map. maps: one a height.
+        moved_mm, turned_deg: change of its pose; moved_mm is NaN where unknown. phi_px: of both cameras.
+        shift_px: root mean square shift of the picture over the first map. maps: one for each height.
     """
 
     moved_mm: float
@@ -88,13 +88,14 @@ class MapChange(Frozen):
 
 
 class ImageDifference(Frozen):
-    """Where two cameras see the same directions, over the image.
+    """The difference between the pixels at which two cameras see the same directions, over the image.
 
     Attributes:
         phi_px: of both. x_px (X,), y_px (Y,): a grid over the image.
-        difference_px: (Y, X, 2) where the second sees the direction that the first sees at a pixel, less the pixel; NaN
-            where either has no answer. angles_deg: (Y, X) between the directions that both see there.
-        turn_deg: of the second's directions to those of the first, which was taken out; 0 where that was not asked for.
+        difference_px: (Y, X, 2) pixel at which the second sees the direction that the first sees at a pixel, minus that
+            pixel; NaN where either has no answer. angles_deg: (Y, X) between the directions that the two see at a
+            pixel.
+        turn_deg: rotation of the second's directions to the first's that was subtracted; 0 where none was requested.
     """
 
     phi_px: tuple[float, float]
@@ -113,13 +114,13 @@ class ImageDifference(Frozen):
 
 
 class Misfit(Frozen, eq=True):
-    """What observations leave.
+    """Residuals of observations.
 
     Attributes:
         points, curves: observations that took part. outliers: those that did not.
-        points_rms_px, curves_rms_px: root mean square lengths of their residuals; 0 of nothing.
-        all_rms_px: the same of points and curves with all outliers in it; infinite where one cannot be shown at all.
-        noise: of points and of curves, times that of the calibration; NaN where either has none.
+        points_rms_px, curves_rms_px: root mean square lengths of their residuals; 0 where there are none.
+        all_rms_px: the same for points and curves including all outliers; infinite where one cannot be shown.
+        noise: of points and of curves, relative to the calibration's; NaN where either has none.
     """
 
     points: int = 0
@@ -132,29 +133,29 @@ class Misfit(Frozen, eq=True):
 
     @property
     def count(self) -> int:
-        """How many observations there are, of both kinds, outliers too."""
+        """Number of observations of both kinds, including outliers."""
         return self.points + self.curves + self.outliers
 
     @property
     def many_out(self) -> bool:
-        """Whether so many were taken out that the rest says little."""
+        """Whether so many were rejected that the rest says little."""
         return self.outliers > 0.25 * self.count
 
 
 class Agreement(Frozen, kw_only=True):
-    """What is said of one station, camera or view; what was not asked is left at its default.
+    """The answer for one station, camera or view; what was not evaluated has its default.
 
     Attributes:
         name: of the station, of the camera, or of the view's frame, station and target.
-        holds: whether the calibration holds there; None where that was not asked, or cannot be said.
-        probability: of as large a difference, or a larger one, where nothing is wrong. statistic: the difference as a
-            squared distance in standard deviations. degrees: how many numbers, or directions of them, it has.
-        words: the answer, in a line. cause: what explains a difference, where a cause was found.
-        change: from the calibration's camera to the one that explains the observations, or to that of the other
-            calibration. image: the same over the image.
-        misfit: what the observations leave. views: the same for each view, of a camera.
-        pose_free: whether the pose that suits the observations best was taken, so that it was not asked about.
-        solution: the calibration by which the observations are explained.
+        holds: whether the calibration holds there; None where this was not tested, or is undecided.
+        probability: of a difference at least as large if nothing is wrong. statistic: the difference as a squared
+            distance in standard deviations. degrees: number of numbers, or of their directions, that are compared.
+        words: the answer in one line. cause: what explains a difference, where a cause was found.
+        change: from the calibration's camera to the one that explains the observations, or to the other calibration's.
+            image: the same over the image.
+        misfit: residuals of the observations. views: for a camera, the answers for each of its views.
+        pose_free: whether the pose was fitted to the observations, and is therefore not tested.
+        solution: the calibration that explains the observations.
     """
 
     name: str
@@ -175,11 +176,11 @@ class Agreement(Frozen, kw_only=True):
 
 
 class Agreements(Frozen, Mapping[str, Agreement]):
-    """The answers by name, of stations or of cameras.
+    """The answers by name, for stations or for cameras.
 
     Attributes:
-        false_alarms: how often any of so many `checks` of a calibration that holds would say that it does not; None
-            where that is not known.
+        false_alarms: probability that any of so many `checks` of a calibration that holds reports that it does not;
+            None where unknown.
     """
 
     answers: Mapping[str, Agreement]
@@ -188,13 +189,13 @@ class Agreements(Frozen, Mapping[str, Agreement]):
 
     @property
     def holds(self) -> bool | None:
-        """Whether all of them hold; None where one cannot be said, and none is known not to."""
+        """Whether all of them hold; None where one is undecided, and none is known not to hold."""
         every = [one.holds for one in self.answers.values()]
         return None if None in every and False not in every else all(every)
 
     @property
     def exit_code(self) -> int:
-        """1 where one does not hold."""
+        """1 where one does not hold, else 0."""
         return int(self.holds is False)
 
     def __repr__(self) -> str:
@@ -215,13 +216,13 @@ class Agreements(Frozen, Mapping[str, Agreement]):
 
 
 def require_posterior(calibration: Calibration) -> None:
-    """Raise InputError where nothing is known of how well a calibration is known."""
+    """Raise InputError where the calibration has no posterior."""
     if calibration.posterior is None:
         raise InputError("the calibration does not say how well it is known: calibrate again")
 
 
 def matched(calibration: Calibration, observations: Observations) -> Observations:
-    """The observations with the targets of both, as the calibration draws them.
+    """Return the observations with the targets of both, as the calibration draws them.
 
     Raises:
         InputError: a camera that the calibration does not have, a station of another camera, or observations outside
@@ -254,7 +255,7 @@ def matched(calibration: Calibration, observations: Observations) -> Observation
 
 
 def require_stations(calibration: Calibration, observations: Observations) -> None:
-    """Raise InputError where a station was observed that the calibration does not have."""
+    """Raise InputError where the calibration does not have a station that was observed."""
     for name in observations.stations:
         if name not in calibration.estimate.stations:
             names = ", ".join(map(repr, calibration.estimate.stations))
@@ -265,7 +266,7 @@ def require_stations(calibration: Calibration, observations: Observations) -> No
 
 
 def field_grids(targets: Mapping[str, Target]) -> list[FieldGrid]:
-    """The grid of the map over the field, at HEIGHTS_M; none without a field."""
+    """Return the grids of the maps over the field, at HEIGHTS_M; none without a field."""
     if all(target.movable for target in targets.values()):
         return []
     return [FieldGrid(height_m, *field_grid(targets)) for height_m in HEIGHTS_M]
@@ -278,10 +279,10 @@ def change_of(
     grids: Sequence[FieldGrid],
     known: Callable[[FieldGrid], Array] | None = None,
 ) -> MapChange:
-    """How a station differs from what an estimate says of it.
+    """Return how a station differs from an estimate of it.
 
     Args:
-        known: (Y, X) mm, the standard deviation to be expected over a grid.
+        known: returns (Y, X) mm, the standard deviation that is expected over a grid.
     """
     camera = before.camera_at(station)
     shift_m, turn = movement(after.cam_from_world, camera.cam_from_world)
@@ -305,9 +306,10 @@ def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Arra
 
 
 def price_nats(let_go: int, count: int) -> float:
-    """By how much misfit must fall for so many numbers let go, of which nothing is known: half the logarithm of the
-    count of observations for each (the Bayesian information criterion; Schwarz, Annals of Statistics 6, 1978), which is
-    for many; and at least by what chance alone exceeds of one number in as few cases as a false alarm may have.
+    """Return by how much the misfit must fall, in nats, for so many freed numbers of which nothing is known. For each
+    it is half the logarithm of the number of observations (the Bayesian information criterion; Schwarz, Annals of
+    Statistics 6, 1978), which holds for many, and at least what chance alone exceeds for one number at the rate of a
+    false alarm.
     """
     return let_go * max(0.5 * math.log(count), _SEEN_NATS)
 
@@ -316,10 +318,11 @@ def price_nats(let_go: int, count: int) -> float:
 
 
 class NormalDistribution(Frozen):
-    """A normal distribution of K numbers, seen from an estimate.
+    """A normal distribution of K numbers, relative to an estimate.
 
     Attributes:
-        information: about them. offsets: (K,) estimate less mean. degrees_of_freedom: spare equations behind its noise.
+        information: about them. offsets: (K,) estimate minus mean. degrees_of_freedom: spare equations behind its
+            noise.
     """
 
     information: Information
@@ -328,11 +331,11 @@ class NormalDistribution(Frozen):
 
 
 class Contrast(Frozen):
-    """By how much the least squared distance to two statements falls when some numbers may differ between them.
+    """How much the least squared distance to two statements falls when some numbers may differ between them.
 
     Attributes:
-        statistic: that fall. shares: (D,) of the variance of each direction that both can tell, what the first one
-            brings to it. degrees_of_freedom: spare equations behind the noise of both.
+        statistic: that fall. shares: (D,) the first statement's share of the variance of each direction that both
+            determine. degrees_of_freedom: spare equations behind the noise of both.
     """
 
     statistic: float
@@ -341,13 +344,13 @@ class Contrast(Frozen):
 
     @property
     def degrees(self) -> int:
-        """How many directions of these numbers both statements determine."""
+        """Number of directions of these numbers that both statements determine."""
         return len(self.shares)
 
     @cached_property
     def probability(self) -> float:
-        """Of such a fall, or a larger one, where nothing differs and the first statement's error is what one in 20
-        exceeds.
+        """Probability of a fall at least as large, if nothing differs and the first statement's error is one that is
+        exceeded in one case of 20.
         """
         total = float(np.sum(self.shares))
         few = total**2 / max(float(np.sum(self.shares**2)), 1e-300)
@@ -356,20 +359,21 @@ class Contrast(Frozen):
 
 
 def _chi2_95(freedom: float) -> float:
-    """What 95 % of chi-squared variables stay below, after Wilson and Hilferty: to 4 % from 1 degree of freedom on."""
+    """Return the 95 % quantile of chi-squared by Wilson and Hilferty: to 4 % from 1 degree of freedom on."""
     spread = 2.0 / (9.0 * max(freedom, 1e-3))
     return freedom * (1.0 - spread + NORMAL_95_ONE_SIDED * math.sqrt(spread)) ** 3
 
 
 def contrast(first: NormalDistribution, second: NormalDistribution, tested: Sequence[Key]) -> Contrast:
-    """The contrast in the tested numbers, all others being the same in both; both speak of the same numbers.
+    """Return the contrast in the tested numbers, while all others are the same in both; both are about the same
+    numbers.
 
-    The first one was made once, and many others are compared with it: its error is the same each time. So what is asked
-    is how often a true second statement would differ as much, given a first one whose own error is as large as it may
-    be (design, section 10).
+    The first statement was made once, and many others are compared with it: its error is the same each time. So the
+    probability is how often a true second statement would differ as much, given a first one whose own error is as large
+    as it may be (design, section 10).
     """
-    testable = 1e-6  # length, at unit columns, that both statements together must leave of a direction
-    determined = 1e-11  # singular value, at unit columns, from which on a direction counts as determined
+    testable = 1e-6  # length that both statements together must leave of a direction, with unit columns
+    determined = 1e-11  # singular value from which on a direction is determined, with unit columns
     roots = first.information.root, second.information.root
     known, at = len(roots[0]), first.information.columns(tested)
     rows = np.vstack(roots)
@@ -377,7 +381,7 @@ def contrast(first: NormalDistribution, second: NormalDistribution, tested: Sequ
     rows /= np.where(sizes > 0.0, sizes, 1.0)
     alike = _basis(rows, determined)
     apart = rows[:, at] * (np.arange(len(rows)) >= known)[:, None]
-    for _ in range(2):  # the second time for what rounding left
+    for _ in range(2):  # the second time against rounding
         apart = apart - alike @ (alike.T @ apart)
     apart = _basis(apart, testable)
     off = np.concatenate([root @ one.offsets for root, one in zip(roots, (first, second), strict=True)])
@@ -388,6 +392,6 @@ def contrast(first: NormalDistribution, second: NormalDistribution, tested: Sequ
 
 
 def _basis(columns: Array, least: float) -> Array:
-    """Orthonormal basis (N, D) of the directions of columns (N, Q) that are longer than `least`."""
+    """Return an orthonormal basis (N, D) of the directions of columns (N, Q) that are longer than `least`."""
     vectors, lengths, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(vectors[:, lengths > least])

@@ -1,10 +1,10 @@
-"""May the calibration of another program be trusted? Asked of observations, by what would have to change for it to
-explain them.
+"""May the calibration of another program be trusted? A test by observations: what would have to change for the
+calibration to explain them.
 
-Ours is fitted to the observations, with whichever lens explains them best. The other's cost stands so far above that
-least one. Had it been made from as many observations as these, twice the difference would be twice a chi-square of as
-many degrees as ours has free numbers; beyond that it is at fault. Then the least change that brings it down to such a
-value is the cause that is named.
+Our own calibration is fitted to the observations, with the lens that explains them best. The statistic is how far the
+other's cost is above this least cost. Had the other been made from as many observations, twice the difference would be
+twice a chi-square of as many degrees as ours has free numbers; beyond that it is at fault. Then the least change that
+reduces it to such a value is reported as the cause.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ceres_cal.problem import Estimate, Layout, Options, Problem, Station, Weigh
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 
-# How often a sound calibration is said to be at fault.
+# Rate at which a sound calibration is reported to be at fault.
 _FALSE_ALARMS = 0.005
 _SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 
@@ -34,16 +34,16 @@ _SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 @checked
 @numerical("the audit")
 def audit(foreign: Calibration, observations: Observations) -> Agreements:
-    """Hold a calibration, ours or another program's, against observations of its stations.
+    """Test a calibration, ours or another program's, by observations of its stations.
 
-    The answer of a station has the least change that explains the observations as its `cause` ("another image size",
+    The answer for a station has as its `cause` the least change that explains the observations ("another image size",
     "half a pixel", "swapped focal lengths", "another unit", "another focal length", "moved", "too few coefficients" or
-    "other intrinsics"), our own calibration of the same observations as its `solution`, and the change from that to the
-    given camera, with how well ours knows places as what is expected. `pose_free`: it did not say where it stands, and
-    the pose that is best for it was taken.
+    "other intrinsics"), as its `solution` our own calibration of the same observations, and as its `change` the change
+    from that to the given camera, with the uncertainty of ours as the expected difference. `pose_free`: the calibration
+    had no pose, and the best one was fitted.
 
     Args:
-        foreign: see `formats.import_calibration`. A single station need not be named as in the observations.
+        foreign: see `formats.import_calibration`. A single station may have another name than in the observations.
 
     Raises:
         InputError: none of its stations was observed. CalibrationError: the observations determine no camera.
@@ -62,7 +62,7 @@ def audit(foreign: Calibration, observations: Observations) -> Agreements:
 
 
 class _AuditCase(Frozen):
-    """One station's observations, those of them that count, and ours."""
+    """Our calibration of one station's observations, and its problem with the inliers."""
 
     ours: Calibration
     problem: Problem
@@ -72,7 +72,7 @@ class _AuditCase(Frozen):
         return next(iter(self.ours.stations))
 
     def least(self, camera: Camera, *, pose: bool, lens: tuple[int, ...] = ()) -> tuple[float, Camera]:
-        """Twice the least cost with a camera, and the camera: its pose free, and these of its intrinsics."""
+        """Return twice the least cost with a camera, and the camera; its pose may be free, and these intrinsics are."""
         estimate, owner = self._with(camera), next(iter(self.ours.cameras))
         free = self.problem.layout
         stations = free.stations if pose else frozenset()
@@ -93,7 +93,7 @@ class _AuditCase(Frozen):
         return replace(old, cameras={owner: camera.at(Pose.identity())}, stations={self.name: station})
 
     def _cost(self, estimate: Estimate) -> float:
-        far = 1e3  # sigmas, of what a camera does not show at all
+        far = 1e3  # sigmas, for observations that a camera does not show
         there, observations = residuals(self.problem.sights, estimate), self.problem.observations
         total = 0.0
         columns: tuple[Columns, ...] = (observations.points, observations.curves)
@@ -121,7 +121,7 @@ def _audited(name: str, given: Camera, observations: Observations) -> Agreement:
     def known(grid: FieldGrid) -> Array:
         return field_map(ours.estimate, ours.uncertainty.posterior, name, grid).sd_mm
 
-    # A camera that is the world stands nowhere over a field, even where its targets have one.
+    # A camera that is the world has no pose over a field, even where its targets include one.
     grids = field_grids(ours.targets) if tied else []
     change = change_of(ours.estimate, name, as_it_is, grids, known if ours.posterior is not None else None)
     return Agreement(
@@ -140,7 +140,7 @@ def _audited(name: str, given: Camera, observations: Observations) -> Agreement:
 
 
 def excess_px(one: Agreement) -> tuple[float, float]:
-    """Root mean square by which the picture of an audited camera is off beyond the noise, and the noise, px."""
+    """Return the root mean square error of an audited camera's picture beyond the noise, and the noise, px."""
     assert one.solution is not None
     fit = one.solution.fit
     noise = float(np.hypot(*fit.noise_px))
@@ -148,19 +148,19 @@ def excess_px(one: Agreement) -> tuple[float, float]:
 
 
 def _case(observations: Observations, given: Camera) -> _AuditCase:
-    """Ours, with the lens that explains the observations best for the number of its coefficients."""
+    """Calibrate with the lens that explains the observations best for the number of its coefficients."""
     lenses = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (2, 3)), ("kannala-brandt", (2, 3)))
     found: list[tuple[float, Calibration]] = []
     failure: CalibrationError | None = None
     for kind, powers in dict.fromkeys([*lenses, (given.lens.kind, given.lens.powers or (2, 3))]):
-        # As drawn, since other programs take targets so.
+        # Targets are as drawn, because other programs take them so.
         own = Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0, as_built="as drawn")
         # quiet: the next lens is tried, and the failure raised where none is left
         tried = attempt(partial(calibrate, observations, own))
         if isinstance(tried, CalibrationError):
             failure = failure or tried
             continue
-        fit, outliers = tried.fit, len(tried.outliers)  # each of them as a residual of five sigmas
+        fit, outliers = tried.fit, len(tried.outliers)  # each counts as a residual of five sigmas
         count = fit.points * 2 + fit.curves
         misfit = count * np.log(fit.rms_px**2) + 25.0 * outliers
         found.append((misfit + len(tried.station().lens.names) * np.log(count), tried))
@@ -177,7 +177,7 @@ def _case(observations: Observations, given: Camera) -> _AuditCase:
 
 
 def _probability(rise: float, degrees: int) -> float:
-    """Of a cost so far above the least, or farther, where both calibrations were made from as many observations."""
+    """Return the probability of a cost so far above the least, if both were made from as many observations."""
     return upper_tail(0.5 * rise, degrees)
 
 
@@ -189,7 +189,7 @@ def _sound(rise: float, degrees: int) -> bool:
 
 
 def _cause(case: _AuditCase, camera: Camera, best: float, degrees: int, posed: bool) -> tuple[str, str]:
-    """The least change after which the camera explains the observations, and what to do."""
+    """Return the least change after which the camera explains the observations, and what to do."""
     for cause, words, changed in _mistakes(camera, case.ours.station()):
         if _sound(case.least(changed, pose=not posed)[0] - best, degrees):
             return cause, words
@@ -217,7 +217,7 @@ def _cause(case: _AuditCase, camera: Camera, best: float, degrees: int, posed: b
 def _freed(
     case: _AuditCase, camera: Camera, here: Camera, best: float, degrees: int, posed: bool
 ) -> tuple[str, str] | None:
-    """What explains it when let go: its focal length, else its pose, else both."""
+    """Return what explains it when freed: its focal length, else its pose, else both; None where none does."""
     zoomed = "it does with a focal length of {:.1f} px in place of {:.1f}"
     tried = [("another focal length", zoomed, camera, 1)]
     if posed:
@@ -231,7 +231,7 @@ def _freed(
 
 
 def _in_metres(camera: Camera, ours: Camera) -> tuple[str, Camera]:
-    """The unit in which it is about as far from the origin as ours, and the camera with its position taken so."""
+    """Return the unit in which it is about as far from the origin as ours, and the camera with metres from that."""
     far = float(np.linalg.norm(camera.position) / np.linalg.norm(ours.position))
     unit = min(IN_A_METRE, key=lambda one: abs(np.log(far / IN_A_METRE[one])))
     pose = camera.cam_from_world
@@ -239,7 +239,7 @@ def _in_metres(camera: Camera, ours: Camera) -> tuple[str, Camera]:
 
 
 def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]:
-    """What goes wrong between programs, what to do, and the camera with it undone."""
+    """Yield mistakes that happen between programs, what to do, and the camera with each corrected."""
     cx, cy = camera.principal_point
     for shift in (-0.5, 0.5):
         moved = replace(camera, principal_point=(cx + shift, cy + shift))
@@ -260,7 +260,7 @@ def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]
 
 
 def resized(camera: Camera, scale: float, image_size: tuple[int, int]) -> Camera:
-    """The camera of images that were scaled: a pixel's centre c goes to s (c + 1/2) - 1/2."""
+    """Return the camera for scaled images: a pixel's centre c goes to s (c + 1/2) - 1/2."""
     cx, cy = (scale * (c + 0.5) - 0.5 for c in camera.principal_point)
     lens = camera.lens.with_values(np.array(camera.lens.values) / camera.lens.scales(scale))
     return replace(camera, image_size=image_size, phi=scale * camera.phi, principal_point=(cx, cy), lens=lens)

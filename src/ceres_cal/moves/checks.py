@@ -1,9 +1,9 @@
-"""Does a calibration still hold? A test of each station's pose and lens against new observations (design, section 10).
+"""Does a calibration still hold? A test of each station's pose and lens by new observations (design, section 10).
 
-What was known and what the new observations say are two statements about the same numbers; whether they differ in the
-pose, or wherever the camera now stands in its intrinsics, by more than both leave open is asked at the noise, and with
-the dependence, that the new observations show. The calibration's own error is the same in every check: it counts as
-large as it may be.
+The posterior and the new observations are two statements about the same numbers. The test is whether they differ by
+more than both leave open, in the pose, or in the intrinsics wherever the camera now stands. It uses the noise and the
+dependence of the new observations. The calibration's own error is the same in every check: it counts as large as it may
+be.
 """
 
 from __future__ import annotations
@@ -51,15 +51,17 @@ from ceres_cal.problem.priors import GaussianPrior, tolerances
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import residuals
 
-# Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
-# -> 0.075 of 80 cases); at double nothing changes.
+# Sigmas up to which an observation is an inlier: of 2000 clean distances to a curve one is longer. At half of it too
+# many good ones are rejected, and false alarms rise (0.05 -> 0.075 of 80 cases); at double nothing changes.
 _INLIER_SIGMA = 3.5
-# Of observations that fit somewhere; with fewer than half nothing is understood. Nothing changes from 0.33 to 0.67.
+# Share of the observations that must fit some pose; otherwise the station is not understood. Nothing changes from 0.33
+# to 0.67.
 _LEAST_SHARE = 0.5
-# m and rad: how far a pose is sought that few observations leave open. Of 640 unmoved cameras with few lines or clicks
-# none is said to have moved, at three times that 2, without a bound 64.
+# Standard deviations (m and rad) of a pose that few observations leave open, around the old one. Of 640 unmoved cameras
+# with few lines or clicks none is said to have moved; at three times this 2, without a bound 64.
 _NEARBY = (0.1, math.radians(5.0))
-# Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
+# Spare equations with which the calibration's noise counts, so that a few new ones that agree by chance do not make it
+# 0.
 _USUAL_EQUATIONS = 4.0
 
 
@@ -70,19 +72,19 @@ def check(
 ) -> Agreements:
     """Test whether a calibration still holds for new observations of its stations.
 
-    Of each station that was observed two things are tested, each at half the level: the six numbers of its pose, and
-    its camera's intrinsics, wherever it stands now. Noise and dependence are those of the new observations. Outliers
-    are those that no pose near by explains. A yes means that these observations show no change, not that there is none:
-    see the sizes.
+    For each observed station two things are tested, each at half the level: the six numbers of its pose, and its
+    camera's intrinsics, wherever it stands now. Noise and dependence are those of the new observations. Outliers are
+    those that no nearby pose explains. A yes means that these observations show no change, not that there is none: see
+    the sizes.
 
     Args:
-        false_alarms: how often an unmoved set of cameras may be said to have moved at least once in so many `checks`
-            with the same calibration; shared among checks and stations. One calibration in 20 is so far off that it
-            may come more often.
+        false_alarms: probability that an unmoved set of cameras is reported as moved at least once in so many `checks`
+            with the same calibration; it is shared among checks and stations. One calibration in 20 is so far off that
+            the rate may be higher.
 
     Raises:
-        InputError: a station that the calibration does not have, or that it says nothing of, or that seems to have
-            moved where its calibration is one of several that show the same.
+        InputError: a station that the calibration does not have, or whose pose it does not know; or a station that
+            seems to have moved where other poses show the same as the calibration's.
         SolutionError: another camera or another field than those calibrated.
     """
     if not 0.0 < false_alarms < 1.0:
@@ -109,11 +111,11 @@ def check(
 # ---- one station ----------------------------------------------------------------------------------------------------
 
 
-_Fit = tuple[float, Estimate]  # twice a least cost, and where
+_Fit = tuple[float, Estimate]  # twice a least cost, and the estimate
 
 
 class _CheckCase(Frozen):
-    """One station's new observations and what was known of its numbers."""
+    """One station's new observations and the prior of its numbers."""
 
     calibration: Calibration
     sight: Sights
@@ -126,34 +128,34 @@ class _CheckCase(Frozen):
 
     @property
     def station_keys(self) -> tuple[Key, ...]:
-        """The station's pose."""
+        """Keys of the station's pose."""
         return tuple(key for key in self.prior.keys if key.kind == "station")
 
     @property
     def lens_keys(self) -> tuple[Key, ...]:
-        """The camera's intrinsics of which something is known."""
+        """Keys of the camera's intrinsics in the prior."""
         return tuple(key for key in self.prior.keys if key.kind == "camera")
 
     @property
     def loosened(self) -> _CheckCase:
-        """The intrinsics known hardly at all: enough to keep a solve from running away along a valley."""
-        # Where a lens has changed, its misfit is no noise. At 30 times it runs along what new observations hardly tell
-        # until nothing is linear, and 3 of 15 unmoved cameras have changed.
+        """The case with a wider prior of the intrinsics: just enough to keep a solve from diverging along a valley."""
+        # Where a lens has changed, its misfit is no noise. With a factor of 30 the solve diverges along directions that
+        # new observations hardly determine, until nothing is linear, and 3 of 15 unmoved cameras seem changed.
         times = 3.0
         scale = [times if key.kind == "camera" else 1.0 for key in self.prior.keys]
         return replace(self, prior=self.prior.widened(np.array(scale)))
 
     @property
     def nearby(self) -> GaussianPrior:
-        """The pose known hardly at all: where few observations leave it open, the nearest one that they allow is asked
-        about, since far along a valley nothing is linear.
+        """A wide prior of the pose: where few observations leave the pose open, the nearest one that they allow is
+        tested, since far along a valley nothing is linear.
         """
         sigmas = {key: _NEARBY[key.unit == "rad"] for key in self.station_keys}
         return GaussianPrior.about(Information.of_sigmas(sigmas), self.estimate)
 
     def problem(self, used: Sights, freed: Collection[Key] = (), noise: float = 1.0) -> Problem:
-        """The station's pose and its camera's intrinsics from what is used, under what was known of all but the freed
-        numbers. `noise`: times that of the calibration.
+        """Return the problem of the station's pose and its camera's intrinsics with some observations, and the prior of
+        all but the freed numbers. `noise`: relative to the calibration's.
         """
         layout = layout_of(self.prior.keys, self.estimate)
         nearby = (self.nearby,) if set(self.station_keys) <= set(freed) else ()
@@ -164,7 +166,7 @@ class _CheckCase(Frozen):
 
     @or_none  # reads: "check no ..." that nothing explains the observations
     def least(self, used: Sights, freed: Collection[Key], pose: Pose) -> _Fit | None:
-        """Twice the least cost, and where, from a pose; None where the solver does not get there."""
+        """Return twice the least cost and its estimate, starting at a pose; None where the solver does not converge."""
         station = replace(self.estimate.stations[self.name], cam_from_world=pose)
         start = replace(self.estimate, stations={self.name: station})
         solution = solve(self.problem(used, freed), start)
@@ -173,9 +175,9 @@ class _CheckCase(Frozen):
     def known(
         self, used: Sights, freed: Collection[Key], estimate: Estimate, keys: tuple[Key, ...]
     ) -> tuple[Information, Array]:
-        """What was known before of all but the freed numbers, over some keys: information, and estimate less mean."""
+        """Return the prior of all but the freed numbers, over some keys: information, and estimate minus mean."""
         whole, offsets = Information.nothing(keys), np.zeros(len(keys))
-        for prior in self.problem(used, freed).priors_at(estimate):  # no two of them speak of the same number
+        for prior in self.problem(used, freed).priors_at(estimate):  # no two of them are about the same number
             whole += prior.information
             offsets[whole.columns(prior.keys)] = prior.offsets(estimate)
         return whole, offsets
@@ -190,7 +192,8 @@ def _case(calibration: Calibration, sight: Sights) -> _CheckCase:
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     kept = [k for k in posterior.keys if k in own or k.is_structure]
     # Another lens may be the right one, and from straight above another phi with another pose; but then the new
-    # observations are seen through that as well. By all that may be together no floor is known to a millimetre.
+    # observations are seen through that lens, too. With all alternatives together no floor would be known to a
+    # millimetre.
     prior = calibration.prior_of(kept, of_lens=True)
     if key.camera in posterior.followed:
         across = posterior.of_lens.given([k for k in posterior.keys if k not in posterior.followed_phi])
@@ -208,7 +211,7 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
     used = sight[:0] if near is None else sight.used(*_inliers(search, near))
     inside, count = (len(s.point_rows) + len(s.curve_rows) for s in (used, sight))
     misfit = Misfit(len(used.point_rows), len(used.curve_rows), count - inside)
-    # With phi under what is known of it: next to it a height says little, and far along that valley nothing is linear.
+    # phi keeps its prior: a height beside a free phi says little, and far along that valley nothing is linear.
     enough = inside >= _LEAST_SHARE * count
     posed = case.least(used, case.station_keys, near.pose) if near is not None and enough else None
     if posed is None:
@@ -219,7 +222,7 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
         anywhere = case.prior.without(case.station_keys)
         of_lens = _apart(case.loosened, used, lensed, anywhere, case.lens_keys)[1]
         apart = min(apart, of_lens, key=lambda one: one.probability)
-    probability = min(2.0 * apart.probability, 1.0)  # the likelier of two questions
+    probability = min(2.0 * apart.probability, 1.0)  # corrected for two tests
     holds = probability >= level
     cause, estimate = (None, posed[1]) if holds else _cause(case, used, posed)
     answer = Agreement(
@@ -236,8 +239,8 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
 
 
 def _cause(case: _CheckCase, used: Sights, posed: _Fit) -> tuple[str, Estimate]:
-    """What explains the observations at the least price, as a refit asks: a movement alone, or another zoom or iris
-    besides; and where.
+    """Return what explains the observations at the least price, as in a refit: a movement alone, or another zoom or
+    iris, too; and the estimate with it.
     """
     key = case.sight.key
     pose, lens = posed[1].stations[key.station].cam_from_world, case.estimate.cameras[key.camera].lens
@@ -255,13 +258,13 @@ def _cause(case: _CheckCase, used: Sights, posed: _Fit) -> tuple[str, Estimate]:
 
 
 def _noise(used: Sights, least: float, free: int) -> tuple[float, float]:
-    """The noise, in that of the calibration, by twice a least cost, and the spare equations behind it."""
+    """Return the noise, relative to the calibration's, by twice a least cost, and the spare equations behind it."""
     freedom = max(used.equations - free, 0) + _USUAL_EQUATIONS
     return math.sqrt((least + _USUAL_EQUATIONS) / freedom), freedom
 
 
 def _change(case: _CheckCase, cause: str | None, anew: Estimate) -> MapChange:
-    """From the calibration's camera to the one that explains the observations."""
+    """Return the change from the calibration's camera to the one that explains the observations."""
     key, posterior = case.sight.key, case.calibration.uncertainty.posterior
     let_go = loosened(cause or "", key.camera, case.estimate.cameras[key.camera].lens)
     shift_m, turn = moved_from(case.prior.without(let_go), posterior, case.name, anew)
@@ -273,15 +276,15 @@ def _change(case: _CheckCase, cause: str | None, anew: Estimate) -> MapChange:
 def _apart(
     case: _CheckCase, used: Sights, fit: _Fit, before: GaussianPrior, tested: tuple[Key, ...]
 ) -> tuple[float, Contrast]:
-    """The noise, in that of the calibration, and how far what was known before and what is seen now are apart, by the
-    observations' fit with the pose free.
+    """Return the noise, relative to the calibration's, and the contrast between the prior `before` and the new
+    observations, by their fit with the pose free.
     """
     least, estimate = fit
     noise, freedom = _noise(used, least, len({*case.station_keys, *tested}))
     problem = case.problem(used, case.station_keys, noise)
     reduced = information(problem, estimate)
     seen, keys = reduced.points + reduced.curves, reduced.shared.keys
-    # At its end the solve's priors pull as much as the observations do, at the noise that they had there.
+    # At the solution, the priors pull as much as the observations do, with the noise that these had in the solve.
     earlier, offsets = case.known(used, case.station_keys, estimate, keys)
     best = seen.inverse @ (earlier.matrix @ offsets) / noise**2
     scatter = measure_scatter(problem, residuals(used, estimate), estimate, reduced)
@@ -296,12 +299,12 @@ def _apart(
 
 
 def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
-    """Which rows of the observations a pose near by explains."""
+    """Return which rows of the observations a nearby pose explains."""
     sight, observations = search.sight, search.sight.observations
     points, curves = (np.zeros(len(c), dtype=bool) for c in (observations.points, observations.curves))
     limit = _INLIER_SIGMA * max(1.0, min(near.scale, 2.0))
     in_points, in_curves = search.residuals(near.pose).in_sigmas(sight, search.scales)
-    points[sight.point_rows], curves[sight.curve_rows] = in_points <= limit, in_curves <= limit  # NaN is not
+    points[sight.point_rows], curves[sight.curve_rows] = in_points <= limit, in_curves <= limit  # not NaN
     return points, curves
 
 
@@ -318,14 +321,14 @@ def _not_understood(case: _CheckCase, misfit: Misfit) -> Agreement:
 
 
 def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreement:
-    """A station that does not hold, of whose movement nothing is known."""
+    """Return the answer for a station that does not hold, and whose movement is unknown."""
     answer = Agreement(name=station, holds=False, probability=0.0, statistic=np.inf, words=words)
     return answer if misfit is None else replace(answer, misfit=misfit)
 
 
 def _words(answer: Agreement) -> str:
     change, misfit = answer.change, answer.misfit
-    worst_mm = change.maps[0].worst_mm if change and change.maps else np.nan  # of a station that sees none of a field
+    worst_mm = change.maps[0].worst_mm if change and change.maps else np.nan  # for a station that sees no field
     if answer.holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
         words = f"holds: no change beyond what is known ({at_most}probability {answer.probability:.2g})"

@@ -1,5 +1,5 @@
-"""Where two calibrations differ, on the field and over the image, how far the cameras stand apart, and whether their
-uncertainties explain it.
+"""Where two calibrations differ, on the field and over the image, by how much their cameras' poses differ, and whether
+their uncertainties explain the differences.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from ceres_cal.problem import EXACT, Estimate, Key, difference
 @checked
 @numerical("the comparison")
 def compare(a: Calibration, b: Calibration, height_m: float = 0.0, station: str | None = None) -> Agreements:
-    """Compare two calibrations, station by station: those of one name, or the only one of each.
+    """Compare two calibrations, station by station: those with the same name, or the only one of each.
 
-    The two count as independent of each other. Where b is a refit of a they share what was known before, and the
-    difference that is to be expected is smaller than stated.
+    The two count as independent. Where b is a refit of a, they share prior knowledge, and the expected difference is
+    smaller than stated.
 
     Raises:
         InputError: no station that both have, or not the one named; no field to draw a map of.
@@ -41,7 +41,7 @@ def compare(a: Calibration, b: Calibration, height_m: float = 0.0, station: str 
 
 
 def _pairs(kind: str, first: Sequence[str], second: Sequence[str], asked: str | None) -> list[tuple[str, str]]:
-    """What is called alike in both, or the only one of each; all, or the one asked for."""
+    """Return pairs with the same name in both, or the only one of each; all pairs, or the one asked for."""
     pairs = [(name, name) for name in first if name in second]
     if not pairs and len(first) == len(second) == 1:
         pairs = [(first[0], second[0])]
@@ -76,8 +76,9 @@ def _compared(a: Calibration, b: Calibration, station: str, other: str, height_m
 def _tested(
     a: Calibration, b: Calibration, one: Estimate, other: Estimate, keys: Sequence[Key], others: Collection[Key]
 ) -> dict[str, Any]:
-    """Holds, probability, statistic and degrees of an answer: whether a and b, of which `one` and `other` are what is
-    compared, contradict each other; nothing where they have another lens or other free numbers, or share none.
+    """Return `holds`, probability, statistic and degrees of an answer: whether a and b contradict each other in `one`
+    and `other`, the parts that are compared. The result is empty where these have another lens or other free numbers,
+    or share none.
     """
     lenses = [[(camera.lens.kind, camera.lens.names) for camera in part.cameras.values()] for part in (one, other)]
     if set(keys) != set(others) or not keys or lenses[0] != lenses[1]:
@@ -97,7 +98,7 @@ def _tested(
 
 
 def _only(calibration: Calibration, station: str) -> Estimate:
-    """One station and its camera."""
+    """Return one station and its camera."""
     old = calibration.estimate
     camera = old.stations[station].camera
     return Estimate({camera: old.cameras[camera]}, {station: old.stations[station]}, {}, old.structure)
@@ -109,12 +110,12 @@ def _only(calibration: Calibration, station: str) -> Estimate:
 def compare_cameras(
     a: Calibration, b: Calibration, camera: str | None = None, *, without_turn: bool = False
 ) -> Agreements:
-    """Compare the intrinsics of two calibrations, camera by camera; neither needs a field.
+    """Compare the intrinsics of two calibrations, camera by camera; no field is needed.
 
     Args:
-        camera: this one alone, by its name in both; else all that both have, or the only one of each.
-        without_turn: take out the rotation that most directions agree on: another principal point looks much like a
-            camera that is turned.
+        camera: only this camera, by its name in both; by default all that both have, or the only one of each.
+        without_turn: whether to subtract the rotation on which most directions agree: another principal point looks
+            much like a turned camera.
 
     Raises:
         InputError: no camera that both have, or not the one named; images of other sizes.
@@ -151,8 +152,8 @@ def _camera_compared(a: Calibration, b: Calibration, name: str, other: str, with
 
 
 def _common_turn(seen: Array, also: Array) -> Array:
-    """(3, 3) the rotation that most of the directions (N, 3) agree on: Cauchy's weights at the median, since lenses
-    differ most in corners that nobody observed.
+    """(3, 3) rotation on which most of the directions (N, 3) agree, by Cauchy's weights at the median: lenses differ
+    most in corners that nobody observed.
     """
     rounds = 20  # of reweighting
     turn = np.eye(3)

@@ -1,6 +1,6 @@
-"""What has happened to a camera: explanations tried on its observations, and which of them they support.
+"""What has happened to a camera: explanations are tried on its observations, and supported ones are taken.
 
-As long as the chosen freedom explains everything, nothing else is asked. Where it does not, others are tried and named.
+As long as the chosen freedom explains everything, no other is tried. Otherwise others are tried and reported.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from ceres_cal.problem import make_structure
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.symmetry import MIRRORED, TURNED
 
-# Share of the observations that another zoom must explain to be looked at. Nothing changes from 0.33 to 0.67.
+# Share of the observations that another zoom must explain to be considered. Nothing changes from 0.33 to 0.67.
 _HALF = 0.5
-# Share of observations that may be taken out where another lens is said to explain the rest. Nothing changes from
-# half to double.
+# Share of observations that may be rejected where another lens is said to explain the rest. Nothing changes from half
+# to double.
 _FEW = 0.2
-# How often an unchanged lens is doubted; a doubt costs only time, other explanations must be supported besides.
-# Nothing changes from half to double.
+# Rate at which an unchanged lens is doubted. A doubt only costs time, because other explanations must be supported,
+# too. Nothing changes from half to double.
 _RARE = 1e-4
-# Times the noise of the old calibration, from where on nothing is explained, unless most observations lie where they
-# should. Nothing changes from half to double.
+# Factor on the old calibration's noise from which on nothing counts as explained, unless most observations lie where
+# they should. Nothing changes from half to double.
 _TOO_NOISY = 4.0
 # Nats by which another explanation must be better than one that the user stated: a factor of 20 000. Nothing changes
-# from half to double. Where nothing was stated the better one is taken: a number let go has its price already.
+# from half to double. Where nothing was stated the better one is taken: a freed number has its price already.
 _SUPPORTED = 10.0
-# A camera whose labels are turned seems to have moved farther than the first (m); with labels turned back it stands
-# within the second of where it was (m), turned by less than the third (rad). Nothing changes from half to double.
+# A camera whose labels are turned seems to have moved farther than the first (m); with the labels turned back it is
+# within the second of its old place (m), turned by less than the third (rad). Nothing changes from half to double.
 _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
 _TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
@@ -58,14 +58,14 @@ WORDS = {
 
 
 class NothingFitsError(SolutionError):
-    """No explanation fits at the noise that was asked for."""
+    """No explanation fits with the noise that was assumed."""
 
 
 class OtherChangeError(SolutionError):
-    """Something else has changed than what was let go.
+    """Something other than what was freed has changed.
 
     Attributes:
-        what: one of `WHAT`, that explains the observations. rivals: what else may.
+        what: one of `WHAT` that explains the observations. rivals: further explanations that may be true.
     """
 
     def __init__(self, message: str, what: str, rivals: tuple[Rival, ...] = ()) -> None:
@@ -74,8 +74,8 @@ class OtherChangeError(SolutionError):
 
 
 def labels_turned(pose: Pose, old: Pose) -> tuple[float, float] | None:
-    """How far (m) the camera moved with the labels as given and with the field's labels turned by half a turn, where
-    the latter is the likelier story: a camera at its place, not one across the field.
+    """Return how far (m) the camera moved with the labels as given and with the field's labels turned by half a turn,
+    where the latter is likelier: a camera near its old place, not across the field; else None.
     """
     given_m, _ = movement(pose, old)
     turned_m, turn = movement(pose @ _TURN, old)
@@ -97,7 +97,7 @@ def require_labels(plan: RefitPlan, poses: Mapping[str, Pose]) -> None:
 
 
 def require_still(plan: RefitPlan) -> None:
-    """Raise SolutionError where a station that is said to stay sees the world from elsewhere."""
+    """Raise SolutionError where a station that is said to stay observes the world from another pose."""
     for name, sight in plan.sights.of_world.items():
         search, old = PoseSearch(sight, plan.known, plan.scales), plan.known.stations[name].cam_from_world
         if name in plan.moved or candidate_at(search, old).fits:
@@ -109,7 +109,7 @@ def require_still(plan: RefitPlan) -> None:
 
 
 def old_poses(plan: RefitPlan, search: PoseSearch) -> list[Pose]:
-    """Where the camera of a search stood before, the search's own station first."""
+    """Return the old poses of a search's camera, those of the search's own station first."""
     stations, key = plan.calibration.estimate.stations, search.sight.key
     names = sorted((n for n in stations if stations[n].camera == key.camera), key=lambda name: name != key.station)
     return [stations[name].cam_from_world for name in names]
@@ -119,8 +119,8 @@ def old_poses(plan: RefitPlan, search: PoseSearch) -> list[Pose]:
 
 
 def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError:
-    """What else the observations of the stations could be, as the error that refuses them; an OtherChangeError where
-    another refit explains them.
+    """Return the error that refuses the observations of the stations, and says what else they could be; an
+    OtherChangeError where another refit explains them.
     """
     names = ", ".join(repr(search.sight.key.station) for search in searches)
     return _other_explanation(plan, searches) or NothingFitsError(
@@ -131,12 +131,12 @@ def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solutio
 
 
 def _other_explanation(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError | None:
-    """The first that fits better than what was known."""
+    """Return the first explanation that fits better than the known lens and field; None where none does."""
     return next((error for search in searches for error in _others(plan, search)), None)
 
 
 def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
-    """Explanations that fit, and better than what was known, with what to do."""
+    """Yield explanations that fit, and fit better than the known lens and field, with what to do."""
     misfit = f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
     old = old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
@@ -169,14 +169,14 @@ def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
 
 
 def _good(candidate: PoseCandidate, known: float) -> bool:
-    """Whether a pose explains the observations about as well as the old calibration did its own, and better than the
-    known lens and labels do, whose least misfit is `known`: strays fit neither.
+    """Return whether a pose explains the observations about as well as the old calibration did its own, and better than
+    the known lens and labels, whose least misfit is `known`: stray observations fit neither.
     """
     return candidate.fits and candidate.scale < NOISIER and candidate.misfit < known - _SUPPORTED
 
 
 def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
-    """The search with its observations renamed or its targets exchanged; structure is left out of it."""
+    """Return the search with renamed observations or exchanged targets; the structure of targets is left out."""
     sights = gather_sights(observations)
     number = sights.keys.index(search.sight.key)
     estimate = replace(search.estimate, structure=make_structure(observations.targets, {}))
@@ -184,7 +184,7 @@ def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
 
 
 def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, PoseCandidate] | None:
-    """The search with the phi that explains it best, and the pose there; None where none explains half of it."""
+    """Return the search with the phi that explains it best, and the pose there; None where none explains half of it."""
     zooms = 15
     best: tuple[PoseSearch, PoseCandidate] | None = None
     for width in (2.0, 1.05, 1.008):  # each grid is finer, around the best of the one before
@@ -201,11 +201,11 @@ def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Pose
 
 
 class RefitVerdict(Frozen, eq=True):
-    """How a solved refit stands to what was known before.
+    """How a solved refit agrees with what was known before.
 
     Attributes:
         strain: squared distance of intrinsics, structure and stations that stay from their prior, in its sigmas.
-        rank: what it is expected to be at most. noise: times that of the old calibration.
+        rank: upper limit of the expected strain. noise: relative to the old calibration's.
     """
 
     strain: float
@@ -214,17 +214,17 @@ class RefitVerdict(Frozen, eq=True):
 
     @property
     def noisy(self) -> bool:
-        """Whether the noise is to be named."""
+        """Whether the noise is to be reported."""
         return self.noise > NOISIER
 
     @property
     def doubtful(self) -> bool:
-        """Whether another explanation should be looked for."""
+        """Whether other explanations are to be tried."""
         return self.noisy or (upper_tail(self.strain, self.rank) < _RARE)
 
 
 def judged(plan: RefitPlan, what: str, result: Calibration) -> RefitVerdict:
-    """Strain and noise of a result."""
+    """Return strain and noise of a result."""
     off = plan.prior_for(what).residuals(result.estimate)
     fit, (points, curves) = result.fit, plan.scales
     ratios = ((fit.points, fit.point_scale / points), (fit.curves, fit.curve_scale / curves))
@@ -233,10 +233,10 @@ def judged(plan: RefitPlan, what: str, result: Calibration) -> RefitVerdict:
 
 
 class Rival(NamedTuple):
-    """What else may have happened, which the observations do not tell from what is taken.
+    """Another explanation, which the observations do not distinguish from the one that is taken.
 
     Attributes:
-        what: one of `WHAT`. probability: of it. found: the calibration where it is true.
+        what: one of `WHAT`. probability: of it. found: the calibration if it is true.
     """
 
     what: str
@@ -247,7 +247,7 @@ class Rival(NamedTuple):
 def supported(
     plan: RefitPlan, result: Calibration, searches: Sequence[PoseSearch], solved_with: Callable[..., Calibration]
 ) -> tuple[Rival, ...]:
-    """What else may be true beside the chosen explanation, where the user stated none.
+    """Return what else may be true besides the chosen explanation, where the user stated none.
 
     Args:
         searches: of each station that moved. solved_with: solves again with another freedom, from an estimate.
@@ -264,18 +264,18 @@ def supported(
         if isinstance(found, Calibration):
             results[what] = found
     quiet = {w: r for w, r in results.items() if judged(plan, w, r).noise < _TOO_NOISY or w == plan.what}
-    # What absorbs a wrong statement, another lens, and what the user said nothing of are not taken so easily.
+    # More support is needed by what absorbs a wrong statement, by another lens, and by what the user did not state.
     is_free = not plan.is_stated and not any(conflict.kind == "prior" for conflict in result.conflicts)
     easily = {plan.what, *(wider[:2] if is_free else ())}
     misfits, count = _misfits(plan, quiet), len(plan.sights.point_rows) + len(plan.sights.curve_rows)
     let_go = {what: len(plan.loosened(what)) for what in quiet}
     scores = {w: misfits[w] + price_nats(let_go[w], count) + _SUPPORTED * (w not in easily) for w in quiet}
     best = min(scores, key=scores.__getitem__)
-    # What explains no more than chance does where a number is let go (Akaike's criterion) is no reason to doubt.
+    # An explanation that gains no more than chance does with a freed number (Akaike's criterion) is no reason to doubt.
     speak_for = [w for w in quiet if w in easily and misfits[w] + let_go[w] <= misfits[plan.what] + let_go[plan.what]]
     rivals = tuple(_rivals({what: scores[what] for what in speak_for}, best, results, solved_with))
     if best != plan.what:
-        # What is as noisy may be something else; what is no noisier than what was asked for might be is taken as well.
+        # A noisy explanation may be something else; one with no more noise than what was asked for may have is taken.
         if judged(plan, best, results[best]).noisy and (other := _other_explanation(plan, searches)) is not None:
             raise other
         gain = scores[plan.what] - scores[best]
@@ -296,21 +296,21 @@ def supported(
 def _rivals(
     scores: Mapping[str, float], best: str, results: Mapping[str, Calibration], solved_with: Callable[..., Calibration]
 ) -> Iterator[Rival]:
-    """Explanations beside the best one, as far as they are probable, with what is known where each is true."""
+    """Yield explanations besides the best one that are probable enough, with the calibration if each is true."""
     likely = {what: float(np.exp(scores[best] - score)) for what, score in scores.items() if best in scores}
     for what, odds in likely.items():
         probability = odds / sum(likely.values())
         if what != best and probability >= LEAST_PROBABILITY:
-            # quiet: what cannot be solved for says nothing
+            # quiet: an explanation that cannot be solved for is no alternative
             found = attempt(partial(solved_with, what, results[what].estimate))
             if isinstance(found, Calibration):
                 yield Rival(what, probability, found)
 
 
 def _explains(plan: RefitPlan, result: Calibration) -> bool:
-    """Whether most of what each moved station sees lies where the result puts it.
+    """Return whether most observations of each moved station lie where the result puts them.
 
-    The noise of its few points alone does not tell: three of five may be strays.
+    The noise of its few points alone does not show that: three of five may be strays.
     """
     moved = (sight for name, sight in plan.sights.of_world.items() if name in plan.moved)
     searches = [PoseSearch(sight, result.estimate, plan.scales) for sight in moved]
@@ -327,7 +327,7 @@ def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
 
 
 def _misfits(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
-    """Misfit of observations and prior, in nats."""
+    """Return the misfit of observations and prior with each explanation, in nats."""
     sights = plan.sights
     fits = [result.fit for result in results.values()]
     scales = (

@@ -1,7 +1,7 @@
-"""Where a camera with a known lens may stand: closed form, the old pose and its turns, then a coarse grid.
+"""Possible poses of a camera with a known lens: closed form, the old pose and its turns, then a coarse grid.
 
-Every candidate is brought to its best by the kernels' own search, first under a wide loss, then at the noise that the
-old calibration saw; the least robust cost wins.
+Every candidate is refined by the kernels' own search, first with a wide loss, then at the noise of the old calibration;
+the least robust cost wins.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start import fit_lines, plane_sight, pose_from_homography
 
-# Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise. Nothing
+# Scales of the loss, in standard deviations, while a candidate is far off: 20 px and 4 px at 0.3 px of noise. Nothing
 # changes from half to double.
 _WIDE = (60.0, 12.0)
-# Turns about each axis of the camera; neighbours' basins overlap.
+# Turns about each axis of the camera; neighbouring basins of convergence overlap.
 _GRID = list(product(np.deg2rad((-24.0, 0.0, 24.0)), repeat=3))
-# m and rad: candidates nearer than this end in one minimum. Nothing changes from half to double.
+# m and rad: candidates closer than this converge to one minimum. Nothing changes from half to double.
 _ALIKE = (0.02, 0.01)
-# Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
+# Nats by which log-likelihoods of competing poses may differ: a factor of 20 000. Nothing changes from half to double.
 _NATS_ALIKE = 10.0
-# Times the noise of the calibration that new observations may have, the likeliest of which is theirs: at one alone a
-# pose goes through some of what is clicked after a calibration by boards, and the others seem to be strays (19 of 120
-# cameras that stand still were moved, now 6; of 120 that were moved 105 were found, now 102). Halved 7, doubled 5.
+# Factors on the calibration's noise that new observations may have; the likeliest is used. With 1 alone a pose passes
+# through some of what is clicked after a calibration by boards, and the others seem to be strays (19 of 120 cameras
+# that stand still were moved, now 6; of 120 that were moved 105 were found, now 102). Halved it is 7, doubled 5.
 NOISES = (1.0, 2.0, 4.0, 8.0)
-# A pose fits where that share of the observations lies within so many standard deviations, at a noise of at most so
-# many times that of the calibration: up to 40 % may be wrong. Nothing changes but at a noise of twice: another iris
-# then fits no pose, and is not named.
+# A pose fits where this share of the observations lies within this many standard deviations, at a noise of at most this
+# factor on the calibration's: up to 40 % may be wrong. Nothing changes, but with a factor of 2 another iris fits no
+# pose, and is not named.
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
 
 
@@ -42,9 +42,9 @@ class PoseCandidate(Frozen):
     """A pose that a station may have.
 
     Attributes:
-        misfit: negative log likelihood of its observations, each of which may be a stray; in nats.
-        scale: median residual, in units of the old calibration's noise. share: of the observations that are within
-            five times that noise (or their own, up to four times as large).
+        misfit: negative log-likelihood of its observations, each of which may be a stray; in nats.
+        scale: median residual, relative to the old calibration's noise. share: of the observations that are within five
+            times that noise (or their own, up to four times as large).
     """
 
     pose: Pose
@@ -54,15 +54,15 @@ class PoseCandidate(Frozen):
 
     @property
     def fits(self) -> bool:
-        """Whether most observations are explained, with a noise that is not absurd."""
+        """Whether most observations are explained, with a plausible noise."""
         return self.share >= _FITS_SHARE and self.scale <= _FITS_SCALE
 
 
 class PoseSearch(Frozen):
-    """What one station sees of the world, through a lens that is taken as known.
+    """One station's observations of the world, through a lens that counts as known.
 
     Attributes:
-        sight: its one sight. scales: noise scales of points and curves to be expected.
+        sight: the station's only sight. scales: expected noise scales of points and curves.
     """
 
     sight: Sights
@@ -71,11 +71,11 @@ class PoseSearch(Frozen):
 
     @property
     def camera(self) -> Camera:
-        """The station's camera, at no particular pose."""
+        """The station's camera, without a particular pose."""
         return self.estimate.cameras[self.sight.key.camera]
 
     def allows(self, pose: Pose) -> bool:
-        """Whether a camera may stand there: over the floor, not in the clouds; a placement may be anywhere near."""
+        """Return whether a pose is possible: above the floor, and not in the clouds; a placement may be anywhere."""
         farthest_m = 1e3
         x, y, height = pose.position
         near = float(np.hypot(x, y)) < farthest_m and abs(float(height)) < farthest_m
@@ -83,17 +83,17 @@ class PoseSearch(Frozen):
 
     @property
     def drawn(self) -> Sights:
-        """The sight of points as drawn: on a plane, also where a board was built bent."""
+        """The sight with points as drawn: on a plane, also where a board was built bent."""
         every = np.concatenate([target.point_array for target in self.sight.observations.targets.values()])
         return replace(self.sight, points=every[self.sight.point_index])
 
     def with_camera(self, camera: Camera) -> PoseSearch:
-        """The same through another lens."""
+        """Return the search with another lens."""
         cameras = {**self.estimate.cameras, self.sight.key.camera: camera}
         return replace(self, estimate=replace(self.estimate, cameras=cameras))
 
     def residuals(self, pose: Pose) -> Residuals:
-        """Residuals of the sight's observations where the camera has this pose in the sight's frame."""
+        """Return the residuals of the sight's observations with this pose of the camera in the sight's frame."""
         key = self.sight.key
         station = replace(self.estimate.stations[key.station], cam_from_world=pose)
         stations = {**self.estimate.stations, key.station: station}
@@ -103,11 +103,11 @@ class PoseSearch(Frozen):
 
 
 def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[PoseCandidate]:
-    """Poses that come into question, best first, each once.
+    """Return possible poses, best first, without repetitions.
 
     Args:
-        old: where the camera stood before. patience: 0 tries the old poses, their turns and the closed form alone; 1
-            the grid around them as well, where none of those fits.
+        old: earlier poses of the camera. patience: 0 tries only the old poses, their turns and the closed form;
+            otherwise the grid around them is tried as well, where none of those fits.
     """
     turns = [(0.0, 0.0, angle) for angle in (np.pi, np.pi / 2, -np.pi / 2)]
     closed = closed_form(search)
@@ -123,10 +123,11 @@ def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) 
 def found_poses(
     sights: Sights, estimate: Estimate, scales: tuple[float, float], old: Mapping[str, Pose], patience: int = 2
 ) -> tuple[Indices, Array]:
-    """Numbers (K,) of the sights of which a pose is found through known lenses, and the likeliest (K, 3, 4) of each.
+    """Return the numbers (K,) of the sights with a pose, through known lenses, and the likeliest pose (K, 3, 4) of
+    each.
 
     Args:
-        scales: see `PoseSearch`. old: where stations stood before. patience: see `pose_candidates`.
+        scales: see `PoseSearch`. old: earlier poses of stations. patience: see `pose_candidates`.
     """
     found = {}
     for number, key in enumerate(sights.keys):
@@ -137,18 +138,18 @@ def found_poses(
 
 
 def alike(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
-    """Those that explain the observations about as well as the best."""
+    """Return those that explain the observations about as well as the best one."""
     return [one for one in candidates if one.misfit <= candidates[0].misfit + _NATS_ALIKE]
 
 
 def least_moved(candidates: Sequence[PoseCandidate], old: Sequence[Pose]) -> PoseCandidate:
-    """The one of the smallest move."""
+    """Return the candidate with the smallest movement."""
     return min(candidates, key=lambda one: min((sum(movement(one.pose, before)) for before in old), default=0.0))
 
 
 def equations(sight: Sights) -> int:
-    """What a sight can say of a pose's six numbers and more: two for each point and straight line, three for each arc,
-    but no more than its observations.
+    """Return how many equations a sight gives for a pose: two for each point and straight line, three for each arc, but
+    no more than its observations.
     """
     tracks, counts = np.unique(sight.track_index, return_counts=True)
     most = np.where(sight.is_arc[tracks], 3, 2)
@@ -156,8 +157,8 @@ def equations(sight: Sights) -> int:
 
 
 def closed_form(search: PoseSearch) -> Pose | None:
-    """The pose by a homography between the lens's rays and the plane of the drawing, from points and straight lines;
-    None where they are too few (a point gives two equations, a line two) or cannot fix it.
+    """Return the pose by a homography between the lens's rays and the plane of the drawing, from points and straight
+    lines; None where they are too few (each gives two equations) or do not determine it.
     """
     rounds = 4  # of the closed form's reweighting
     plane = plane_sight(search.drawn, height_m=0.0)
@@ -170,10 +171,10 @@ def closed_form(search: PoseSearch) -> Pose | None:
 
 
 def _refined(search: PoseSearch, poses: Sequence[Pose], wides: Sequence[float] = _WIDE) -> list[PoseCandidate]:
-    """Each candidate at its best, best first; those from which something cannot be seen are left out.
+    """Return each candidate at its minimum, best first, without poses from which something cannot be seen.
 
     Args:
-        wides: scales of the loss before the one at the noise that is expected, in standard deviations.
+        wides: scales of the loss, in standard deviations, before the last one at the expected noise.
     """
     stack = np.array([pose.matrix for pose in poses])
     for wide in wides:
@@ -184,7 +185,7 @@ def _refined(search: PoseSearch, poses: Sequence[Pose], wides: Sequence[float] =
 
 
 def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance: float) -> Array:
-    """Poses (K, 3, 4) after the search, without those from which something cannot be seen."""
+    """Return poses (K, 3, 4) after the search, without those from which something cannot be seen."""
     if not len(stack):
         return stack
     key, count = search.sight.key, len(stack)
@@ -198,7 +199,7 @@ def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance:
 
 
 def candidate_at(search: PoseSearch, pose: Pose) -> PoseCandidate:
-    """How well a pose explains the sight."""
+    """Return how well a pose explains the sight."""
     there = search.residuals(pose)
     points, curves = there.in_sigmas(search.sight, search.scales)
     lengths = np.nan_to_num(np.concatenate([points / 1.1774, curves / 0.6745]), nan=np.inf)
@@ -209,7 +210,7 @@ def candidate_at(search: PoseSearch, pose: Pose) -> PoseCandidate:
 
 
 def _distinct(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
-    """The candidates, best first, without repetitions."""
+    """Return the candidates, best first, without repetitions."""
     kept: list[PoseCandidate] = []
     for candidate in sorted(candidates, key=lambda c: c.misfit):
         moves = [movement(candidate.pose, other.pose) for other in kept]
@@ -219,7 +220,7 @@ def _distinct(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
 
 
 def movement(a: Pose, b: Pose) -> tuple[float, float]:
-    """Distance (m) between the positions of two cameras, and the angle (rad) between them."""
+    """Return the distance (m) between the positions of two cameras, and the angle (rad) between their orientations."""
     cosine = 0.5 * (float(np.trace(a.rotation @ b.rotation.T)) - 1.0)
     sine = float(np.linalg.norm(a.rotation - b.rotation)) / np.sqrt(8.0)  # |a - b| = 2 sqrt 2 sin(angle / 2)
     angle = 2.0 * np.arcsin(min(sine, 1.0)) if cosine > -0.9 else np.arccos(np.clip(cosine, -1.0, 1.0))
@@ -227,9 +228,9 @@ def movement(a: Pose, b: Pose) -> tuple[float, float]:
 
 
 def moved_from(known: GaussianPrior, before: Posterior, station: str, now: Estimate) -> tuple[float, float]:
-    """How far (m) and by what angle (rad) a station stands from where what was known puts it beside everything else as
-    it is seen now: its height changes with phi, and it has not moved for that. How far is NaN where no more is known of
-    phi than a valley that was followed.
+    """Return how far (m) and by what angle (rad) a station has moved from its prior, given everything else as it is
+    seen now: a height that changes with phi is no movement. The distance is NaN where phi is only known to be in a
+    valley that was followed.
     """
     keys = pose_keys("station", station)
     own = known.given(keys, now)
@@ -239,7 +240,7 @@ def moved_from(known: GaussianPrior, before: Posterior, station: str, now: Estim
 
 
 def moved_words(shift_m: float, turned_deg: float, about: str = "") -> str:
-    """How far a station moved."""
+    """Return in words how far a station moved."""
     if np.isnan(shift_m):
         return f"turned by {about}{turned_deg:.3f} deg (how far it moved is not known: its phi is not)"
     return f"moved by {about}{1e3 * shift_m:.1f} mm and {turned_deg:.3f} deg"

@@ -1,6 +1,6 @@
-"""What of an old calibration is carried into the next one: its estimate as a start, its posterior as a prior.
+"""What of an old calibration is used for the next one: its estimate as a start, its posterior as a prior.
 
-The same observations under other names: a field turned by half a turn, mirrored, or of other dimensions.
+Also the same observations under other names: of a field turned by half a turn, mirrored, or of other dimensions.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ceres_cal.scene import TURNED, Lens, Target, counterparts, target_from_spec
 
 
 def relabelled(observations: Observations, image: Array) -> Observations | None:
-    """The observations of what lies in the world, renamed after the features that x, y, z times `image` sends theirs
-    to; None where one has no such feature.
+    """Return the observations of the world with each feature replaced by the one at x, y, z times `image`; None where
+    an observed feature has no such counterpart.
     """
     points, curves = observations.points, observations.curves
     p, c, side = points.feature.copy(), curves.feature.copy(), curves.side.copy()
@@ -39,8 +39,8 @@ def relabelled(observations: Observations, image: Array) -> Observations | None:
 
 
 def mistaken_targets(observations: Observations) -> dict[str, Observations]:
-    """The observations as if a target were one of those that it may be mistaken for and that have all the features
-    which were seen, such as the other division's field; by what that is, in words.
+    """Return the observations with a target replaced by each one that it may be mistaken for, such as the other
+    division's field, and that has all observed features; the keys are the other targets in words.
     """
     every = {
         words: _seen_as(observations, name, target_from_spec(spec, words))
@@ -51,7 +51,7 @@ def mistaken_targets(observations: Observations) -> dict[str, Observations]:
 
 
 def _seen_as(observations: Observations, name: str, other: Target) -> Observations | None:
-    """The observations of a target with those of its features in another one that are called alike."""
+    """Return the observations with features of the same names in another target; None where one does not exist."""
     target, points, curves = observations.targets[name], observations.points, observations.curves
     of_it = np.array([view.target == name for view in observations.views], dtype=bool)
     p, c = points.feature.copy(), curves.feature.copy()
@@ -67,7 +67,7 @@ def _seen_as(observations: Observations, name: str, other: Target) -> Observatio
     return replace(observations, targets=targets, points=replace(points, feature=p), curves=replace(curves, feature=c))
 
 
-# Of its natural size, by how much a number that was let go has usually changed.
+# Usual change of a freed number, as a share of its natural size.
 _CHANGED = 0.05
 
 WHAT = ("auto", "pose", "pose-only", "zoom", "iris", "everything")
@@ -75,10 +75,10 @@ LABELS = ("check", "as-given", "turned")
 
 
 class RefitOptions(Frozen, eq=True):
-    """What a refit takes for granted.
+    """Assumptions of a refit.
 
     Attributes:
-        hold_others: hold stations that stay and their cameras exactly; their posterior still learns.
+        hold_others: whether stations that stay and their cameras are held exactly; their posterior is still updated.
         labels: "check" them against a turn by 180 degrees, take them "as-given", or "turned".
         priors: new knowledge, such as a height measured after the move.
 
@@ -96,16 +96,16 @@ class RefitOptions(Frozen, eq=True):
 
 
 class RefitPlan(Frozen):
-    """A refit as it was asked for.
+    """A refit as it was requested.
 
     Attributes:
         calibration: the old one. sights: of the new observations, with the targets of both.
-        options: of the solves. what: one of WHAT but "auto". is_stated: whether the user says so. asked: how.
-        stations: the observed stations and their cameras. moved: those whose poses are sought.
-        stays: stations of the old calibration that are where they were, under its posterior.
-        known: the old cameras, structure and stations that stay; those that moved at no particular pose.
-        prior: what is known beforehand, `what` not yet taken into account. scales: noise scales of points and curves
-            seen before.
+        options: of the solves. what: one of WHAT except "auto". is_stated: whether the user stated `what`. asked:
+            options of the refit.
+        stations: observed stations -> their cameras. moved: those whose poses are solved for.
+        stays: stations of the old calibration that have not moved, with its posterior as a prior.
+        known: the old cameras, structure and stations that stay; stations that moved have no particular pose.
+        prior: prior knowledge before `what` is taken into account. scales: earlier noise scales of points and curves.
     """
 
     calibration: Calibration
@@ -127,16 +127,16 @@ class RefitPlan(Frozen):
         return frozenset(self.stations[name] for name in self.moved)
 
     def loosened(self, what: str) -> frozenset[Key]:
-        """The intrinsics of which nothing is taken to be known any more."""
+        """Return the intrinsics about which nothing counts as known any more."""
         cameras = self.calibration.cameras
         return frozenset().union(*(loosened(what, name, cameras[name].lens) for name in self.moved_cameras))
 
     def prior_for(self, what: str) -> GaussianPrior:
-        """What is known beforehand when so much is let go."""
+        """Return the prior with these intrinsics freed."""
         return self.prior.without(self.loosened(what))
 
     def usual(self, what: str) -> GaussianPrior:
-        """That numbers which are let go have changed by about as much as is usual, or by far more."""
+        """Return a prior by which freed numbers have changed by about the usual amount, or by far more."""
         gone = sorted(self.loosened(what))
         sigmas = _CHANGED * natural_sizes(self.known, gone)
         return replace(
@@ -145,7 +145,7 @@ class RefitPlan(Frozen):
 
 
 def loosened(what: str, camera: str, lens: Lens) -> frozenset[Key]:
-    """The intrinsics of a camera of which a refit of `what` takes nothing to be known any more."""
+    """Return the intrinsics of a camera about which a refit of `what` assumes nothing."""
     which = {"zoom": ("phi",), "iris": lens.names, "everything": intrinsic_names(lens)}.get(what, ())
     return frozenset(key for key in intrinsic_keys(camera, lens) if key.quantity in which)
 
@@ -157,11 +157,11 @@ def make_plan(
     moved: Collection[str] | None = None,
     asked: RefitOptions | None = None,
 ) -> RefitPlan:
-    """Who moved, who stays, and what is known of everything; where nobody states what has changed, as if it had only
-    moved.
+    """Return which stations moved and which stay, and what is known of everything; where `what` is not stated, only
+    poses have changed.
 
     Raises:
-        InputError: a name that is not there, or a calibration that does not say how well it is known.
+        InputError: an unknown name, or a calibration without a posterior.
         SolutionError: another camera or another field than those calibrated, by image size or dimensions.
     """
     if what not in WHAT:
@@ -177,18 +177,18 @@ def make_plan(
     old = calibration.estimate.stations
     for name in stations.keys() - chosen - old.keys():
         raise InputError(f"station {name!r} is to stay where it was, but the calibration has no such station")
-    elsewhere = {stations[name] for name in stations}  # a camera that was observed is where it was observed
+    elsewhere = {stations[name] for name in stations}  # an observed camera is only where it was observed
     stays = frozenset(n for n, s in old.items() if n not in chosen and (n in stations or s.camera not in elsewhere))
     asked = asked or RefitOptions()
     observed = _turned(observed) if asked.labels == "turned" else observed
-    same = calibration.digest == observations.digest  # then the question is the same, too
+    same = calibration.digest == observations.digest  # then it is the same refit again
     if same and calibration.refitted is None:
         raise InputError(
             "these are the observations that the calibration was made of, and it is what they say: give new ones, or "
             "calibrate these again with what is known besides"
         )
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
-    require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
+    require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # those are the old calibration's
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
     prior = carried_prior(calibration, observations, stays, of_lens=what in ("pose", "pose-only"))
     placed = {name: old[name] for name in old if name in stays}
@@ -224,14 +224,14 @@ def _turned(observations: Observations) -> Observations:
 def carried_prior(
     calibration: Calibration, observations: Observations, stays: frozenset[str], *, of_lens: bool = False
 ) -> GaussianPrior:
-    """What is known of intrinsics, structure and stations that stay, without these observations.
+    """Return the prior of intrinsics, structure and stations that stay, without these observations.
 
-    The posterior of the calibration, all else integrated out. Where it has these same observations in it already, it is
-    what had been known before them: nothing counts twice. Nor do other lenses that predicted as well, where they are
-    asked one by one.
+    It is the marginal posterior of the calibration. Where that already includes these same observations, it is the
+    prior that was used before them: nothing counts twice. Other lenses that predicted as well do not count twice,
+    either, where they are evaluated one by one.
 
     Args:
-        of_lens: what is known where the chosen lens is the right one.
+        of_lens: return the prior if the chosen lens is right.
     """
     if calibration.refitted is not None and calibration.digest == observations.digest:
         before = calibration.refitted.prior
@@ -245,9 +245,10 @@ def _is_kept(key: Key, stays: frozenset[str]) -> bool:
 
 
 def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem, Layout]:
-    """What is solved, and the layout of what is known at all: the posterior speaks of everything, held or not.
+    """Return the problem to solve, and the layout of all that is known: the posterior includes everything, held or not.
 
-    What is tried beside what was asked for few observations may leave open: it has its usual size then.
+    Few observations may not determine the freed numbers of an explanation that was not asked for: they get a prior of
+    their usual change.
     """
     everything = plan.calibration.uncertainty.posterior.layout(plan.calibration.estimate)
     free, stations = everything.free, plan.moved | (plan.stays & everything.stations)

@@ -1,7 +1,7 @@
-"""After a move: the poses anew, everything else under what was known of it (design, section 10).
+"""Refit after a move: new poses, with the old posterior as a prior of everything else (design, section 10).
 
-The same path as `calibrate`, from the old calibration's closed form with a known lens to solve, reject, solve, assess;
-the old posterior is one more prior, as a full matrix.
+The path is that of `calibrate`: from a closed form with the old calibration's lens to solve, reject, solve, assess. The
+old posterior is one more prior, as a full matrix.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting, diffe
 from ceres_cal.robust.other_minima import solved_soon
 from ceres_cal.start import Start, chained_poses
 
-# Equations with which a pose is the only one: six numbers, and two that contradict a wrong one. Nothing changes at
-# half of it; at double four corners are refused.
+# Equations with which a pose is unique: six numbers, and two that contradict a wrong one. Nothing changes at half of
+# it; at double four corners are refused.
 _UNIQUE = 8
 _SMALL = (0.3, np.deg2rad(15.0))
 
@@ -63,26 +63,27 @@ def refit(
     options: RefitOptions | None = None,
     progress: SolveProgress | None = None,
 ) -> Calibration:
-    """A calibration after cameras were moved, from few new observations and all that was known.
+    """Calibrate again after cameras were moved, from few new observations and all that was known.
 
-    Stations that were not observed stay under the old posterior, but for those of a camera that was observed elsewhere:
-    they are dropped, the camera is not there any more. Placements are not carried over, only what the new observations
-    show is placed. Priors of the old options are in the posterior already; those on the new observations count as new.
-    A refit to the observations of a refit asks the same question once more: what was known before them is the prior
-    then, and nothing counts twice. The observations that a calibration was made of are refused.
+    Stations that were not observed keep the old posterior, except for those of a camera that was observed elsewhere:
+    they are dropped, because the camera is no longer there. Placements are not carried over; only what the new
+    observations show is placed. Priors of the old options are in the posterior already; those on the new observations
+    count as new. A refit to the observations of the last refit repeats it: the prior is what was known before them, and
+    nothing counts twice. The observations of which a calibration was made are refused.
 
     Args:
-        what: "auto" ("pose", or "zoom" or "iris" where the observations say so), "pose" (intrinsics under their
-            posterior), "pose-only" (intrinsics held; how well they are known still counts in the new posterior), "zoom"
-            (nothing is known of phi any more), "iris" (nothing of the lens's coefficients), "everything" (nothing of
-            the intrinsics).
-        moved: observed stations that moved; by default all. The other observed ones stay under their posterior.
+        what: "auto" ("pose", or "zoom" or "iris" where the observations say so), "pose" (intrinsics with their
+            posterior as a prior), "pose-only" (intrinsics held; their uncertainty still counts in the new posterior),
+            "zoom" (phi counts as unknown), "iris" (the lens's coefficients count as unknown), "everything" (all
+            intrinsics do).
+        moved: observed stations that moved; by default all. The other observed stations keep their posterior as a
+            prior.
 
     Raises:
-        InputError: names that do not fit the calibration, one that does not say how well it is known, or its own
-            observations.
+        InputError: names that do not fit the calibration, a calibration without a posterior, or its own observations.
+        DegenerateError: the observations do not determine a pose, or not uniquely after so large a move.
         DegenerateError: the observations cannot tell a pose, or not for sure after so large a move.
-        SolutionError: no explanation fits, or another one than `what` allows for does; the message says which.
+        SolutionError: no explanation fits, or one does that `what` does not allow; the message says which.
     """
     plan = make_plan(calibration, observations, what, moved, options)
     try:
@@ -103,7 +104,7 @@ def refit(
 
 
 def _misfit(plan: RefitPlan) -> float:
-    """Of the best poses at the noise of the plan, in nats."""
+    """Return the misfit of the best poses at the noise of the plan, in nats."""
     searches = [PoseSearch(sight, plan.known, plan.scales) for sight in _moved_sights(plan)]
     every = [pose_candidates(search, old_poses(plan, search), patience=0) for search in searches]
     return sum(candidates[0].misfit if candidates else np.inf for candidates in every)
@@ -148,7 +149,7 @@ _TWICE = "these observations are in the old calibration's past already: what the
 
 
 def _start(plan: RefitPlan) -> Estimate:
-    """Poses of everything that is sought, lenses as they were (or zoomed, where that may be)."""
+    """Return the poses of everything that is sought, with the old lenses (or zoomed ones, where that is allowed)."""
     require_still(plan)
     poses: dict[str, Pose] = {}
     cameras = dict(plan.known.cameras)
@@ -175,7 +176,7 @@ def _moved_sights(plan: RefitPlan) -> list[Sights]:
 
 
 def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
-    """The search as it is understood, and the station's pose there."""
+    """Return the search with the lens that explains it, and the station's pose."""
     old = old_poses(plan, search)
     candidates = pose_candidates(search, old)
     fitting = [one for one in alike(candidates) if one.fits]
@@ -191,7 +192,7 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
 
 
 def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
-    """Raise DegenerateError where so few features cannot tell a large move from another one."""
+    """Raise DegenerateError where too few features do not determine a large move."""
     known = equations(search.sight)
     moves = [movement(pose, before) for before in old]
     if known >= _UNIQUE or any(shift_m < _SMALL[0] and turn < _SMALL[1] for shift_m, turn in moves):
@@ -220,8 +221,9 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 
 def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
-    """Wider by what the lenses that predicted as well before would say from where they see the new observations: one
-    picture tells a lens's numbers, and not which lens it is. Of another zoom or iris nobody knows what they would say.
+    """Widen the posterior by lenses that predicted as well before, with the poses from which they see the new
+    observations: one picture determines a lens's numbers, but not which lens it is. After another zoom or iris the
+    other lenses are unknown.
     """
     known = plan.calibration.uncertainty.posterior
     if result.posterior is None or len(known.lenses) < 2 or plan.loosened(plan.what):
@@ -229,12 +231,12 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     sights = gather_sights(plan.sights.observations.part(*result.inlier_masks(plan.sights.observations)))
     problem, layout = refit_problem(plan, "pose-only", result.estimate)
     _, *said = problem.priors
-    followed = result.posterior.followed  # where a valley says what phi may be
+    followed = result.posterior.followed  # cameras with a valley of phi
     unfollowed = plan.moved_cameras - set(followed)
     free = {name: own[own == 0] if name in unfollowed else own[:0] for name, own in layout.free.items()}
     layout, weighting = replace(layout, stations=plan.moved, free=free), Weighting(*result.fit.scales)
     problem = replace(problem, sights=sights, layout=layout, priors=(), weighting=weighting)
-    # Each with the numbers it had, the chosen one as well: what the new observations add is not what they differ by.
+    # Each keeps its old numbers, also the chosen one: what new observations change is no difference between lenses.
     stays = plan.stays & result.stations.keys()
     starts = [
         replace(
@@ -244,7 +246,7 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
         )
         for lens in known.lenses
     ]
-    # quiet: a lens that sees the new observations from nowhere says nothing of what moved
+    # quiet: a lens without a pose for the new observations says nothing about what moved
     found = [solved_soon(problem, start) for start in starts]
     here = {name: result.cameras[name] for name in plan.moved_cameras}
     seen = [
@@ -253,7 +255,7 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     ]
     reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in sights.cameras}
     lenses = OtherLenses(seen[0], tuple(seen[1:]), known.lens_weights, reach_px)
-    # Each has its own phi: what was known of that with the chosen one, which was the prior, limits no other one's.
+    # Each lens has its own phi: the prior of phi is from the chosen lens, and does not limit that of another one.
     stated, told = result.posterior.stated, {key for one in said for key in one.keys}
     phi = [key for key in stated.keys if key.quantity == "phi" and key not in told]
     posterior = replace(result.posterior, stated=stated.without(phi))
@@ -261,7 +263,7 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
 
 
 def _beside_rivals(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival]) -> Calibration:
-    """With what else may have happened, each as far as it is probable."""
+    """Add the other explanations to the posterior, each by its probability."""
     posterior, so_far = result.posterior, 1.0 - sum(one.probability for one in rivals)
     for what, probability, found in rivals:
         so_far += probability
@@ -273,8 +275,8 @@ def _beside_rivals(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival]
 
 
 def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
-    """With cameras that were not observed as they were, and all that was known of them: one normal distribution was
-    their prior, and that is wider.
+    """Restore cameras that were not observed, and all that was known of them: their prior was a single normal
+    distribution, which is wider.
     """
     kept = [name for name in result.cameras if name not in plan.stations.values()]
     if result.posterior is None or not kept:
@@ -312,8 +314,8 @@ def _explained(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival], ch
 
 
 def movements(before: Calibration, after: Calibration, what: str = "pose") -> dict[str, tuple[float, float]]:
-    """How far (m; NaN where that is not known) and by how much (degrees) each station that both have was moved, by a
-    refit of `what`.
+    """Return how far (m; NaN where unknown) and by how much (degrees) each station that both have was moved, by a refit
+    of `what`.
     """
     known, old = before.uncertainty.posterior, before.estimate
     moves = {}

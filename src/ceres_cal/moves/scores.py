@@ -1,4 +1,4 @@
-"""How well cameras explain observations that they were not calibrated from: intrinsics held, poses at their best."""
+"""How well cameras explain observations that they were not calibrated from: intrinsics held, poses solved for."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from ceres_cal.start import Start, chained_poses
 def score(
     calibration: Calibration, observations: Observations, *, options: Options | None = None, hold_stations: bool = False
 ) -> Agreements:
-    """How well new observations of fields or boards agree with a calibration: poses alone are solved for.
+    """Score how well new observations of fields or boards agree with a calibration: only poses are solved for.
 
-    Targets are taken as the calibration says that they were built. A calibration of another program will do. The
-    answers are those of its cameras, with what each view leaves, the worst first, and the poses that suit the
-    observations best (`solution`). A camera holds where the noise is that of its calibration; None where it has none.
+    Targets are taken as built, by the calibration. A calibration of another program can be scored, too. The answers are
+    for its cameras, with the residuals of each view, worst first, and the best poses (`solution`). A camera holds where
+    the noise is that of its calibration; `holds` is None where it is somewhat larger, or the calibration has none.
 
     Args:
         options: loss and rejection; those of the calibration by default.
-        hold_stations: stations stand where the calibration has them, so that only boards are posed: the poses of a
-            rig's cameras, or of a camera over its field, are tested, too.
+        hold_stations: whether stations keep the calibration's poses, so that only boards are posed: this also tests the
+            poses of a rig's cameras, or of a camera over its field.
 
     Raises:
         InputError: a camera, or a station that is held, which the calibration does not have.
-        DegenerateError: naming the sight whose pose the observations do not determine.
+        DegenerateError: the observations do not determine the pose of the sight that the message names.
         SolutionError: another camera or target than those calibrated, or intrinsics that do not explain them at all.
     """
     observed = matched(calibration, observations)
@@ -75,14 +75,14 @@ def score(
 
 
 def sights_as_built(observations: Observations, calibration: Calibration) -> Sights:
-    """The sights of targets as the calibration says that they were built."""
+    """Return the sights with targets as built, by the calibration."""
     sights = gather_sights(observations)
     built = calibration.options.structure_of(observations.targets).carrying(calibration.estimate.structure)
     return built.built_into(sights)
 
 
 def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station]) -> Estimate:
-    """Every sight's pose under the calibrated lens, chained into stations and placements."""
+    """Return the poses of all sights with the calibrated lens, chained into stations and placements."""
     stations = {name: Station(camera, Pose.identity()) for name, camera in sights.observations.stations.items()}
     cameras = {name: calibration.cameras[name] for name in sights.observations.cameras}  # some of a rig's
     blank = Estimate(cameras, stations, {}, EXACT)
@@ -92,7 +92,7 @@ def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station
 
 
 def _spare(calibration: Calibration) -> tuple[float, float]:
-    """The part of points' equations, and of curves', beyond the unknowns: by which their noise is known."""
+    """Return the spare equations of points and of curves, those beyond the unknowns, behind their noise."""
     every, unknowns = (2 * calibration.fit.points, calibration.fit.curves), calibration.fit.unknowns
     left = 1.0 - unknowns / max(sum(every), unknowns, 1)
     points, curves = (max(left * one, 1.0) for one in every)
@@ -100,8 +100,9 @@ def _spare(calibration: Calibration) -> tuple[float, float]:
 
 
 def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool | None, str]:
-    """Whether a camera predicts what it was scored by, and the sentence that says so; `spare` equations behind the
-    noise of these and of those that it was made from, of which few make one many times the other by chance.
+    """Return whether a camera predicts the scored observations, and the sentence that says so. `spare`: equations
+    behind the noise of these and of the calibration's observations; where they are few, one is many times the other by
+    chance.
     """
     noise = max((one for one in misfit.noise if one == one), default=np.nan)
     size = f"to {two_digits(max(misfit.points_rms_px, misfit.curves_rms_px))} px"
@@ -124,7 +125,7 @@ def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool
 
 
 def _noise_ratios(posed: Calibration, before: Calibration) -> tuple[float, float]:
-    """Noise of points and of curves over that of the calibration, px over px; NaN where either has none."""
+    """Return the noise of points and of curves over that of the calibration, px over px; NaN where either has none."""
     pairs = zip(posed.fit.noise_px, before.fit.noise_px, strict=True)
     points, curves = (new / old if new > 0.0 and old > 0.0 else float("nan") for new, old in pairs)
     return points, curves
