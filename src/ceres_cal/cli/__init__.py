@@ -1,7 +1,7 @@
 """The commands: `ceres-cal COMMAND ...` (design, section 11).
 
-Only argparse is imported at the top of the commands' modules, so that help and wrong usage answer at once; and of these
-only the one whose command is typed.
+The commands' modules import only argparse at the top, and only the module of the typed command is imported, so that
+help and errors of usage appear at once.
 """
 
 from ceres_cal.base.frozen import names_of

@@ -95,7 +95,7 @@ def _verdict(advice: diagnostics.Advice) -> Iterator[str]:
 
 
 def _range(promise: diagnostics.Promise) -> str:
-    """What a promise that depends on phi may become; nothing where it hardly does."""
+    """Words on the range of a promise that depends on phi; "" where it hardly does."""
     if promise.rough:
         return " (roughly: phi stays open)"
     low, high = promise.worst_range_mm
@@ -119,7 +119,7 @@ def _promise_data(promise: diagnostics.Promise) -> dict[str, Any]:
 
 
 def _measurement_data(measurement: diagnostics.Measurement) -> dict[str, Any]:
-    """The measurement as files of observations have its parts."""
+    """Return the measurement in the form of files of observations."""
     return {
         "kind": measurement.kind,
         "words": measurement.words,

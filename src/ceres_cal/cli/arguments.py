@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and what people type as values of them."""
+"""Arguments that several commands share, and parsers of their values."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def camera_option(what: str = "name of the camera", default: str | None = "camer
 
 
 def board_option(what: str, **about: Any) -> Any:
-    """The option --board of a chessboard."""
+    """The option --board for a chessboard."""
     return option(what, "COLUMNSxROWSxMM", elsewhere=("columns", "rows", "square"), **about)
 
 
 def output_option(what: str, default: Any = REQUIRED, metavar: str = "FILE") -> Any:
-    """The option -o FILE, or FOLDER."""
+    """The option -o FILE, or -o FOLDER."""
     return option(f"{_PLACES.get(metavar, '')}for {what}", metavar, default, flags=("-o", "--output"))
 
 
 def prior_option(metavar: str = "OWNER.NAME=VALUE:SIGMA", what: str = "", group: str = "") -> Any:
-    """The option --prior of observations' cameras and stations."""
+    """The option --prior for cameras and stations of the observations."""
     every = (
         "what is known beforehand: height_m or position_m of a station; phi (the focal length, px), principal_point, "
         f"aspect (fy / fx) or a coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left "
@@ -72,7 +72,7 @@ def estimate_option(**about: Any) -> Any:
 
 
 def not_painted_option(what: str, **about: Any) -> Any:
-    """The option --not-painted of lines."""
+    """The option --not-painted for lines."""
     return option(what, "NAME,...", "", **about)
 
 
@@ -92,13 +92,13 @@ def timeout_option() -> Any:
 
 
 def frames_option() -> Any:
-    """The option --frames N, of videos."""
+    """The option --frames N, for videos."""
     what = "how many photographs to take out of a video, the sharpest of as many stretches"
     return option(what, "N", 30, read=whole(1))
 
 
 class ReportArguments(QuietArguments):
-    """Of a command that may write what it made, and a page."""
+    """Arguments of a command that may write its result, and a report."""
 
     output: Path | None
     report: Path | None = option("file for a page (.html): may it be trusted, for what, to how many mm", "PAGE")
@@ -114,17 +114,17 @@ class ReportArguments(QuietArguments):
 
 
 def parse_number(text: str, where: str) -> float:
-    """A finite number; InputError naming `where`."""
+    """Parse a finite number; an InputError names `where`."""
     return finite(text, InputError(f"{where}: {text.strip()!r} is not a finite number, such as -0.15"))
 
 
 def parse_numbers(text: str, where: str) -> tuple[float, ...]:
-    """Finite numbers between commas; InputError naming `where`."""
+    """Parse finite numbers between commas; an InputError names `where`."""
     return tuple(parse_number(part, where) for part in text.split(","))
 
 
 def parse_length(text: str, where: str, unit: str = "m") -> float:
-    """A length in `unit`, which is that of a plain number, too: "0.15", "150mm", "2.5 cm", "5m"."""
+    """Parse a length in `unit`, which is also the unit of a plain number: "0.15", "150mm", "2.5 cm", "5m"."""
     found = _LENGTH.fullmatch(text)
     if found is None:
         return parse_number(text, where)
@@ -132,12 +132,12 @@ def parse_length(text: str, where: str, unit: str = "m") -> float:
 
 
 def parse_lengths(text: str, where: str) -> tuple[float, ...]:
-    """Lengths between commas, in metres."""
+    """Parse lengths between commas, in metres."""
     return tuple(parse_length(part, where) for part in text.split(","))
 
 
 def length(unit: str) -> Callable[[str], float]:
-    """The type of an argument that is a length in `unit`; its name says which."""
+    """Return the type of an argument that is a length in `unit`, which its name states."""
 
     def parse(text: str) -> float:
         try:
@@ -158,14 +158,14 @@ def share(text: str) -> float:
 
 
 def name(text: str) -> str:
-    """The type of an argument that names something: files hold it as UTF-8."""
+    """The type of an argument that is a name, which files hold as UTF-8."""
     if not text or text != printable(text):
         raise ArgumentTypeError(f"'{printable(text)}' is no name in UTF-8: give another one")
     return text
 
 
 def parse_board(text: str) -> tuple[int, int, float]:
-    """COLUMNSxROWSxMM: inner corners, and the side of a square in metres."""
+    """Parse COLUMNSxROWSxMM: inner corners, and the side of a square; return the side in metres."""
     parts = text.lower().split("x")
     if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
         raise InputError(f"board {text!r}: write COLUMNSxROWSxSQUARE, such as 9x6x25mm")
@@ -178,7 +178,7 @@ def is_described(text: str) -> bool:
 
 
 def board_words(text: str) -> list[str]:
-    """A board as `detect board` takes it: COLUMNSxROWSxMM, or a target."""
+    """Return the arguments of `detect board` for a board: COLUMNSxROWSxMM, or a target."""
     if is_described(text):
         return ["--target", text]
     columns, rows, square_m = parse_board(text)
@@ -186,15 +186,15 @@ def board_words(text: str) -> list[str]:
 
 
 def repeated(option: str, values: Iterable[str]) -> list[str]:
-    """An option that is given with each of the values."""
+    """Return an option repeated with each of the values."""
     return [word for value in values for word in (option, value)]
 
 
 def named_values(option: str, form: str, parse: Callable[[str, str], _T], specs: Iterable[str]) -> dict[str, _T]:
-    """What is said of each name by an option that is given as NAME=VALUE.
+    """Parse an option that is given as NAME=VALUE; return the values by name.
 
     Args:
-        form: how it is written. parse: a value, and how to name it in messages.
+        form: how it is written. parse: parser of a value, which also takes its name in messages.
     """
     found: dict[str, _T] = {}
     for spec in specs:
@@ -209,25 +209,25 @@ def named_values(option: str, form: str, parse: Callable[[str, str], _T], specs:
 
 
 def parse_facing(specs: Iterable[str]) -> dict[str, str]:
-    """The side of the picture by name."""
+    """Parse --facing: the side of the picture by name."""
     return named_values("--facing", f"NAME=SIDE, such as {FACING_EXAMPLE}", lambda side, _: side, specs)
 
 
 def parse_names(text: str) -> list[str]:
-    """Names between commas."""
+    """Parse names between commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def metres(height_mm: float | None) -> float:
-    """--height-mm in metres; 0 where it was not given."""
+    """Convert --height-mm to metres; 0 where it was not given."""
     return 0.0 if height_mm is None else height_mm / 1000.0
 
 
 def parse_prior(spec: str, owners: Mapping[str, Collection[str]], quantities: Mapping[str, Sequence[str]]) -> Prior:
-    """The prior of a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; InputError that names it.
+    """Parse a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; an InputError names it.
 
     Args:
-        owners: names of stations, and of cameras. quantities: those that may be named, of a station and of a camera.
+        owners: names of stations, and of cameras. quantities: possible quantities of a station and of a camera.
     """
     where = f"--prior {spec!r}"
     left, equals, right = spec.rpartition("=")
@@ -252,16 +252,16 @@ def parse_prior(spec: str, owners: Mapping[str, Collection[str]], quantities: Ma
 
 
 def parse_priors(specs: Sequence[str], owners: Mapping[str, Collection[str]], options: Options) -> list[Prior]:
-    """The priors of `--prior` arguments beside options of `calibrate`."""
+    """Parse `--prior` arguments, given the other options of `calibrate`."""
     quantities = {"station": ("height_m", "position_m"), "camera": (*options.intrinsic_names, "principal_point")}
     return [parse_prior(spec, owners, quantities) for spec in specs]
 
 
 def parse_estimates(specs: Sequence[str], targets: Mapping[str, scene.Target]) -> tuple[Prior, ...]:
-    """What is known of dimensions of targets by `--estimate` arguments: [TARGET.]NAME[=VALUE[:SIGMA]],...
+    """Parse `--estimate` arguments, [TARGET.]NAME[=VALUE[:SIGMA]],...: priors on dimensions of targets.
 
     Raises:
-        InputError: what no target has, several have, or is given twice.
+        InputError: a dimension that no target has, several have, or that is given twice.
     """
     every = [_parsed(part, targets) for spec in specs for part in parse_names(spec)]
     for number, prior in enumerate(every):
@@ -292,7 +292,7 @@ def _parsed(text: str, targets: Mapping[str, scene.Target]) -> Prior:
 
 
 def _meant(word: str, dimensions: Mapping[str, float]) -> Iterator[str]:
-    """The dimensions that a word may mean: itself, the field's own, else all that have it in their names."""
+    """Yield the dimensions that a word may mean: its own or the field's, else all whose names contain it."""
     asked = word.strip().lower().replace("-", "_").removesuffix("_m")
     own = [name for name in dimensions if name.removesuffix("_m") in (asked, f"field_{asked}")]
     parts = set(asked.split("_"))

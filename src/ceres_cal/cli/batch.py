@@ -1,4 +1,4 @@
-"""`ceres-cal batch`: many calibrations, checks and refits over processes, each by its own command."""
+"""`ceres-cal batch`: many calibrations, checks and refits in several processes, each by its own command."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, o
 from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile
 
 _COMMANDS = ("calibrate", "check", "refit")
-_READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
+_READ = ("observations", "calibration", "inputs", "images")  # arguments that are names of files
 _OWN = {"-o", "--output", "--report", "--json"}
 _SUMMARY = "summary.html"
 _EXIT_CODES = {"failed": 3, "no": 1}
 _WORDS = {"failed": "failed", "no": "not to be trusted, or moved", "care": "usable with limits", "good": "good"}
 _LEVELS = {"failed": "no"}
-"""What the page colours otherwise."""
+"""Levels that the page colours differently."""
 _MOST_REASONS = 4
 
 
@@ -70,13 +70,13 @@ def _run(
 
 
 def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False) -> list[cli.Job]:
-    """The jobs of a plan, with all that `work` needs; what they write goes into the folder `to`.
+    """Return the jobs of a plan, with all that `work` needs; their outputs go into the folder `to`.
 
     Args:
-        options: that every calibrate job gets besides. reports: whether calibrate and refit write one.
+        options: further options of every calibrate job. reports: whether calibrate and refit write a report.
 
     Raises:
-        InputError: the plan cannot be read, or a row is wrong usage of its command; it says which.
+        InputError: the plan cannot be read, or a row is wrong usage of its command; the message says which.
     """
     base = plan if plan.is_dir() else plan.parent
     of_all, jobs = cli.words_of(options, "--options"), []
@@ -103,13 +103,13 @@ def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path
 
 
 def _written(outputs: Sequence[Path]) -> Iterator[str]:
-    """The options for what a job writes: a calibration and, where there is one, a report."""
+    """Yield the options for what a job writes: a calibration and possibly a report."""
     for name, file in zip(("-o", "--report"), outputs, strict=False):
         yield from (name, str(file))
 
 
 def _files(path: Path) -> list[Path]:
-    """A file or folder, or what a pattern stands for; what is missing is the job's to say."""
+    """Return a file or folder, or the files that match a pattern; the job itself reports missing files."""
     return [path] if path.exists() else [Path(one) for one in sorted(glob.glob(str(path)))] or [path]  # noqa: PTH207
 
 
@@ -117,7 +117,7 @@ def work(job: cli.Job) -> cli.Outcome:
     """Do one job, by its command.
 
     Raises:
-        CalibrationError: as the command has it.
+        CalibrationError: as raised by the command.
     """
     data = COMMANDS[job.command].answer([*job.arguments, *_written(job.outputs)], quiet=True).data
     return _of_check(job, data) if job.command == "check" else _of_calibration(job, data)
@@ -171,10 +171,10 @@ def _sections(page: str, outcomes: Sequence[cli.Outcome], again: int) -> tuple[S
 
 
 def summary_page(title: str, outcomes: Sequence[cli.Outcome], links: dict[str, str]) -> str:
-    """The page.
+    """Return the page.
 
     Args:
-        links: a job's name -> file beside the page to look at.
+        links: name of a job -> file beside the page.
     """
     most_cards = 40
 

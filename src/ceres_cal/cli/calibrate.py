@@ -1,4 +1,4 @@
-"""`ceres-cal calibrate`: the main job."""
+"""`ceres-cal calibrate`: calibration of cameras from files of observations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CAMERA, _SOLVE = "the camera", "the solve"
 
 
 def _lens_kind(name: str) -> str:
-    """A kind of lens that is in the table; the default needs none, nor do help and wrong usage."""
+    """Check a kind of lens against the table, which is not imported for the default, for help or for wrong usage."""
     if name != _AUTO and name not in scene.LENSES:
         known = ", ".join(map(repr, (*scene.LENSES, _AUTO)))
         raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {known})")
@@ -34,7 +34,7 @@ def _lens_kind(name: str) -> str:
 
 
 class CalibrateArguments(arguments.ReportArguments):
-    """What is to be solved for and how; what is named as in `Options` goes there as it is."""
+    """What is estimated and how; arguments with names of `Options` are passed on unchanged."""
 
     observations: tuple[str, ...] = argument(
         "OBS", "files of observations (.json, .npz, or one folder .columns); several are taken together"
@@ -146,7 +146,7 @@ def _run(args: CalibrateArguments) -> Document:
     files.require_outputs(args, args.observations)
     files.require_different(args.observations)
     fixed = arguments.named_values("--fix", "NAME=VALUE, such as k3=0", arguments.parse_number, args.fix)
-    powers = _powers(args)  # wrong usage is said before anything is read
+    powers = _powers(args)  # errors of usage are raised before anything is read
     observations = files.read_observations(args.observations)
     photographs = files.report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
@@ -166,8 +166,8 @@ def _run(args: CalibrateArguments) -> Document:
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:
-    """Of the scheduler there, whose answer is awaited for some seconds; nothing without an address."""
-    patience_s = 5.0  # with a scheduler
+    """Connect to the scheduler at an address, waiting some seconds for its answer; no client without an address."""
+    patience_s = 5.0  # time to wait for a scheduler
     if address is None:
         return nullcontext()
     try:
@@ -182,14 +182,14 @@ def _client(address: str | None) -> AbstractContextManager[Any]:
 
 
 def _solve_progress(bar: ProgressBar) -> SolveProgress:
-    """The solver's callback; a solve begins with its iteration 0."""
+    """Return the solver's callback; a solve begins with its iteration 0."""
     solves = 0
 
     def show(progress: Progress) -> None:
         nonlocal solves
         solves += progress.iteration == 0
         note = f"solve {solves}, iteration {progress.iteration}, cost {progress.cost:.6g}"
-        bar.update(progress.iteration, 0, note)  # after how many it comes to rest nobody knows
+        bar.update(progress.iteration, 0, note)  # the number of iterations until convergence is unknown
 
     return show
 
@@ -211,11 +211,11 @@ def _powers(args: CalibrateArguments) -> tuple[int, ...]:
 
 
 def _options(args: CalibrateArguments, observations: Observations, **parsed: Any) -> Options:
-    """The options; `parsed`: powers and what is fixed."""
+    """Make the options; `parsed`: powers and fixed numbers."""
     from ceres_cal.problem import Options, dimensions_of
 
     terms = tuple(arguments.parse_names(args.terms))
-    parsed |= {"lens": args.lens or _AUTO, "terms": terms}  # powers alone make radial
+    parsed |= {"lens": args.lens or _AUTO, "terms": terms}  # with powers alone the lens is radial
     lengths, drawn = arguments.parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
     owners = {"station": observations.stations, "camera": observations.cameras}
     priors = arguments.parse_priors(args.prior, owners, Options(**parsed))
@@ -231,7 +231,7 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
 
 
 def _tolerances(specs: Sequence[str]) -> dict[str, Tolerance]:
-    """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m|heights_m|stretch_m=SIGMA."""
+    """Parse `--tolerance` arguments: TARGET.lines_m|points_m|warp_m|heights_m|stretch_m=SIGMA."""
     from ceres_cal.problem.structure import Tolerance
 
     given: dict[str, dict[str, Any]] = {}

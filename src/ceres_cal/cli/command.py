@@ -1,10 +1,11 @@
-"""What every command has: a name, arguments, and a document that it answers, for people or for scripts.
+"""Commands: each has a name, arguments, and a document as its answer, for users or for scripts.
 
-The arguments of a command are the parameters of its function, each with its help, from which the parser is made; and,
-where it shares them with others or hands all of them on, fields of a subclass of `Arguments`, which it takes as `args`.
+The arguments of a command are the parameters of its function, each with its help, from which the parser is made.
+Arguments that commands share, or that a command passes on together, are fields of a subclass of `Arguments`, which the
+function takes as `args`.
 
-A parameter is made by `option`, `switch` or `argument`; its type says the rest: an argument that is a tuple takes any
-number, of a Literal one is chosen, and Path, int and float are read as such.
+A parameter is made by `option`, `switch` or `argument`. Its type determines the rest: a tuple takes any number of
+values, a Literal is a choice, and Path, int and float are parsed.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from ceres_cal.base import Frozen, InputError, LazyTable, cached_property, did_y
 from ceres_cal.report.document import Document
 
 _T = TypeVar("_T")
-_GIVEN = "given"  # what was typed of options so far
-_FORM = "option "  # before the names of a format's options: theirs may be those of the command's own arguments
+_GIVEN = "given"  # name under which the options typed so far are kept
+_FORM = "option "  # prefix of the options of formats, whose names may be those of the command's own arguments
 REQUIRED: Any = MISSING
-"""The default of an option that must be given."""
+"""Default of an option that must be given."""
 
 
 def option(
@@ -41,14 +42,15 @@ def option(
     beside: tuple[str, ...] = (),
     elsewhere: tuple[str, ...] = (),
 ) -> Any:
-    """A field that is an option, --like-this where its name is like_this.
+    """Define a field that is an option, --like-this for the name like_this.
 
     Args:
-        help: what it does; a function where that takes an import. Its default, where it has one, is added.
-        flags: how it is typed, where otherwise. read: a value from its text, where its type does not say it.
-        repeatable: whether it may be given again and again; the field is a tuple.
-        group: title in the help. alone: of options of the same word one may be given. beside: names of options of which
-            one has to be given, too. elsewhere: names of options of other commands that are for the same.
+        help: what it does; a function if that needs an import. The default value is appended, if there is one.
+        flags: how it is typed, if not by its name. read: parser of its text, if its type is not enough.
+        repeatable: whether it may be given several times; the field is a tuple.
+        group: title in the help. alone: only one of the options with the same word may be given.
+        beside: names of options of which one must be given, too.
+        elsewhere: names of options of other commands with the same purpose.
     """
     given = {"flags": flags, "read": read, "repeatable": repeatable, "group": group, "alone": alone}
     about = {"help": help, "metavar": metavar, "beside": beside, "elsewhere": elsewhere, **given}
@@ -56,25 +58,25 @@ def option(
 
 
 def switch(help: str, default: bool | None = False, **about: Any) -> Any:
-    """A field that is an option without a value, which makes it the contrary of its default; about: see `option`."""
+    """Define an option without a value, which inverts its default; about: see `option`."""
     return option(help, default=default, **about)
 
 
 def argument(
     metavar: str, help: str | Callable[[], str], default: Any = REQUIRED, *, read: Callable[[str], Any] | None = None
 ) -> Any:
-    """A field that is typed without a name before it: files, where `read` says nothing else."""
+    """Define a positional argument: files, unless `read` says otherwise."""
     return field(default=default, metadata={"help": help, "metavar": metavar, "read": read})
 
 
 def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
-    """A field (Mapping[str, str]) of what is given of the options of formats, as typed; what they are, formats say."""
+    """Define a field (Mapping[str, str]) of the given options of formats, as typed; formats define these options."""
     return field(default_factory=dict, metadata={"forms": forms})
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 class Arguments(Frozen, eq=True, kw_only=True):
-    """What every command takes; in each class below it, too, fields are given by name."""
+    """Arguments of every command; in each subclass, too, fields are given by name."""
 
     json: bool = switch("print one JSON object")
 
@@ -83,18 +85,18 @@ class Arguments(Frozen, eq=True, kw_only=True):
 
 
 class QuietArguments(Arguments):
-    """Of a command that shows how far it is."""
+    """Arguments of a command that shows progress."""
 
     quiet: bool = switch("no progress")
 
     @property
     def silent(self) -> bool:
-        """Whether nothing is shown on the way."""
+        """Whether no progress is shown."""
         return self.quiet or self.json
 
 
 def add_options(parser: Parser, kind: type[Arguments]) -> None:
-    """Add everything that a command takes to a parser."""
+    """Add all arguments of a command to a parser."""
     types, places = get_type_hints(kind), {"": parser}
     common = {one.name for one in fields(QuietArguments)}
     for one in sorted(fields(kind), key=lambda one: one.name in common):
@@ -115,7 +117,7 @@ def add_options(parser: Parser, kind: type[Arguments]) -> None:
 
 
 def filled(kind: type[_T], given: argparse.Namespace) -> _T:
-    """The dataclass of what was typed."""
+    """Make the dataclass from what was typed."""
     values = vars(given)
     typed = {name.removeprefix(_FORM): text for name, text in values.items() if name.startswith(_FORM)}
     every = fields(kind)  # type: ignore[arg-type]
@@ -129,17 +131,17 @@ def filled(kind: type[_T], given: argparse.Namespace) -> _T:
 
 
 def flag(name: str) -> str:
-    """How an option is typed: --error-mm of error_mm."""
+    """Return how an option is typed: --error-mm for error_mm."""
     return f"--{name.replace('_', '-')}"
 
 
 def given(args: Arguments) -> dict[str, Mapping[str, Any]]:
-    """What was given, by name, with what was said of each where it is defined."""
+    """Return the arguments that differ from their defaults, by name, with their definitions."""
     return {one.name: one.metadata for one in fields(args) if getattr(args, one.name) != one.default}
 
 
 def _require_beside(args: Arguments) -> None:
-    """Raise InputError for an option without the one that it belongs to."""
+    """Raise InputError for an option without one that it requires."""
     every = given(args)
     for name, about in every.items():
         if (others := about.get("beside", ())) and every.keys().isdisjoint(others):
@@ -147,7 +149,7 @@ def _require_beside(args: Arguments) -> None:
 
 
 def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Names and settings of an argparse argument."""
+    """Return names and settings of an argparse argument."""
     about, item = one.metadata, _item(kind)
     how: dict[str, Any] = {"help": _help(one), "metavar": about["metavar"]}
     if get_origin(item) is Literal:
@@ -174,7 +176,7 @@ def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, An
 
 
 class _Once(argparse.Action):
-    """Stores what an option is given; of two values the first would be lost without a word."""
+    """Stores the value of an option, and refuses a second, different one, as the first would be lost silently."""
 
     def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: str | None = None) -> None:
         before = vars(given).setdefault(_GIVEN, {}).setdefault(self.dest, value)
@@ -184,7 +186,7 @@ class _Once(argparse.Action):
 
 
 def _file(text: str) -> str:
-    """The type of an argument that names files; no name, such as of a variable that is not set, is no folder."""
+    """The type of an argument that names files; an empty name, such as of an unset variable, is refused."""
     if text in ("", "-"):
         raise argparse.ArgumentTypeError(f"{text!r} is no file: give its name (./- where that is -)")
     return text
@@ -196,7 +198,7 @@ def _number(text: str) -> float:
 
 
 def whole(least: float = -float("inf"), most: float = float("inf")) -> Callable[[str], int]:
-    """The type of an argument that is a whole number, in a range where that is given."""
+    """Return the type of an argument that is a whole number, possibly in a range."""
     range_words = (f" of {least} or more" if most > 1e9 else f" from {least} to {most}") if abs(least) < 1e9 else ""
 
     def parse(text: str) -> int:
@@ -215,7 +217,7 @@ _READ: dict[Any, Callable[[str], Any]] = {
 
 
 def _item(kind: Any) -> Any:
-    """Path, of Path | None and of tuple[Path, ...]."""
+    """Path, for Path | None and for tuple[Path, ...]."""
     inner = [one for one in get_args(kind) if one not in (NoneType, Ellipsis)]
     return kind if get_origin(kind) is Literal or not inner else _item(inner[0])
 
@@ -235,7 +237,7 @@ def _escaped(text: str) -> str:
 
 
 def _of_forms(forms: Iterable[Any]) -> Mapping[str, list[str]]:
-    """Every option of some formats, with what it means to each of them."""
+    """Return every option of some formats, with its meaning for each of them."""
     every: dict[str, dict[str, list[str]]] = {}
     for form in forms:
         for name, (_, text) in form.options.items():
@@ -244,12 +246,12 @@ def _of_forms(forms: Iterable[Any]) -> Mapping[str, list[str]]:
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse whose complaints are one line, and which takes "-1.5,2" for the numbers they are."""
+    """argparse with errors of one line, which accepts "-1.5,2" as numbers."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
-        self._negative_number_matcher = re.compile(r"-\.?\d")  # argparse's own from Python 3.14 on
-        self.elsewhere: dict[str, str] = {}  # an option of other commands: the one of this command that is for the same
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # the same as argparse's from Python 3.14 on
+        self.elsewhere: dict[str, str] = {}  # option of other commands -> this command's option with the same purpose
 
     def error(self, message: str) -> NoReturn:
         meant = ""
@@ -268,9 +270,9 @@ class Command(Frozen, eq=True):
     Attributes:
         name: as it is typed, such as "detect board".
         summary: one line for the help.
-        work: does it; raises CalibrationError. Its parameters are its arguments, but for `args`, which is annotated
-            with the dataclass of others.
-        examples: of its use, without "ceres-cal" and the name, for the help. preset: what need not be typed.
+        work: function that does the work; raises CalibrationError. Its parameters are the arguments, except `args`,
+            which is annotated with the dataclass of shared ones.
+        examples: of its use, without "ceres-cal" and the name, for the help. preset: arguments that need not be typed.
     """
 
     name: str
@@ -281,7 +283,7 @@ class Command(Frozen, eq=True):
 
     @cached_property
     def arguments(self) -> type[Arguments]:
-        """The dataclass of what is typed."""
+        """The dataclass of the arguments."""
         from inspect import signature
 
         types = get_type_hints(self.work)
@@ -291,12 +293,12 @@ class Command(Frozen, eq=True):
         return type("Typed", (shared,), {"__annotations__": annotated, **own}) if own else shared
 
     def run(self, args: Arguments) -> Document:
-        """What it answers to its arguments."""
+        """Return the answer to the arguments."""
         names = get_type_hints(self.work).keys() - {"return"}
         return self.work(**{name: args if name == "args" else getattr(args, name) for name in names})
 
     def parse(self, arguments: Sequence[str]) -> Any:
-        """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
+        """Parse typed arguments; InputError for wrong usage. Positional arguments may stand between options."""
         parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
         self.fill(parser)
         args = filled(self.arguments, parser.parse_intermixed_args([*self.preset, *arguments]))
@@ -304,17 +306,17 @@ class Command(Frozen, eq=True):
         return args
 
     def answer(self, arguments: Sequence[str], *, quiet: bool = False) -> Document:
-        """What it answers to what is typed; `quiet`: without showing how far it is."""
+        """Return the answer to typed arguments; `quiet`: without progress."""
         quietly = ["--quiet"] if quiet and issubclass(self.arguments, QuietArguments) else []
         return self.run(self.parse([*arguments, *quietly]))
 
     def typed(self, arguments: Sequence[str]) -> str:
-        """The whole of it as one types it."""
+        """Return the whole command line."""
         return shlex.join(["ceres-cal", *self.name.split(), *arguments])
 
     @property
     def about(self) -> dict[str, Any]:
-        """What a parser says of the command."""
+        """Settings of the command's parser."""
         calls = "\n".join(f"  ceres-cal {self.name} {example}" for example in self.examples)
         return {
             "description": f"{sentence(self.summary)}.",
@@ -323,13 +325,13 @@ class Command(Frozen, eq=True):
         }
 
     def fill(self, parser: Parser) -> None:
-        """Add all of its arguments to a parser."""
+        """Add all arguments of the command to a parser."""
         add_options(parser, self.arguments)
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
 
 
 def _of_others(option: str) -> str:
-    """The end of a message: of which other commands it is an option, as far as there are few."""
+    """End of a message: the other commands that have the option, if there are few."""
     owners, few = list[str](), 3
     for name, one in COMMANDS.items():
         parser = Parser(add_help=False)
@@ -339,7 +341,7 @@ def _of_others(option: str) -> str:
 
 
 def command(name: str, summary: str, *examples: str) -> Callable[[Callable[..., Document]], Command]:
-    """Makes a command of the function that does its work."""
+    """Make a command of the function that does its work."""
     return lambda work: Command(name, summary, work, examples)
 
 
@@ -379,4 +381,4 @@ _MODULES = {
 
 
 COMMANDS: Mapping[str, Command] = LazyTable("ceres_cal.cli", _MODULES, Command)
-"""Every command by its name."""
+"""All commands by name."""

@@ -1,4 +1,4 @@
-"""`ceres-cal completion`: what a shell needs to complete commands, options and files."""
+"""`ceres-cal completion`: the script with which a shell completes commands, options and files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def _run(
 
 
 def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
-    """One parser of all commands; those of two words below their first. Files complete wherever a value is free."""
+    """Make one parser of all commands, with those of two words as subcommands of the first. Values without choices
+    complete as files.
+    """
     root = Parser(prog="ceres-cal", description="Calibrate an overhead camera.")
     below = {"": root.add_subparsers()}
     for name in sorted(commands):

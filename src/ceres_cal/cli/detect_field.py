@@ -22,7 +22,7 @@ _CORNER = "TopLeftCorner=102,88"
 
 
 class FieldArguments(QuietArguments):
-    """Photographs, the field in them, and where to start."""
+    """Photographs, the field in them, and the initial estimate."""
 
     images: tuple[str, ...] = argument(
         "IMAGE", "photographs that one camera took at one station, folders of them, or a video"
@@ -125,7 +125,7 @@ def _run(args: FieldArguments) -> Document:
 
 
 def _drawing(picture: Path | None, target: scene.Target) -> Callable[[Path, detect.SearchResult], None] | None:
-    """Draws what was seen in the first photograph that is refused."""
+    """Return a function that draws what was seen in the first photograph that is refused; None without a picture."""
     if picture is None:
         return None
 
@@ -180,7 +180,7 @@ def _corners(specs: Sequence[str]) -> detect.Clicks:
 def _sections(
     detections: detect.FieldDetections, merged: dict[str, Any], output: Path, given: Sequence[Path] = ()
 ) -> Iterator[Section]:
-    """The answer; `given`: what the one picture was made of."""
+    """Yield the answer; `given`: the pictures that the one picture was made of."""
     observations, images = detections.observations, [_image_data(path, detections) for path in detections.found]
     points, curves = len(observations.points), len(observations.curves)
     every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
@@ -222,8 +222,8 @@ def _image_data(path: str, detections: detect.FieldDetections) -> dict[str, Any]
 
 
 def _stretched(camera: scene.Camera) -> bool:
-    """Whether its pixels are farther from square than those of cameras."""
-    square = 0.005  # of fy / fx: those of cameras are nearer to 1
+    """Whether its pixels are less square than those of usual cameras."""
+    square = 0.005  # largest deviation of fy / fx from 1 for usual cameras
     return abs(camera.aspect - 1.0) > square
 
 
@@ -247,7 +247,7 @@ def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 
 def _ways(searched: dict[str, Any]) -> str:
-    """In how many ways a photograph could be taken for the field, and what chose one."""
+    """Words on how many ways a photograph could be taken for the field, and what chose one."""
     if searched["settled_by"] is None:
         return "in the one way it can be seen"
     by = {"facing": "--facing", "before": "the calibration of before"}[searched["settled_by"]]

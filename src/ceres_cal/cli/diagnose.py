@@ -1,4 +1,4 @@
-"""`ceres-cal diagnose`: what the residuals of a calibration say of it."""
+"""`ceres-cal diagnose`: what the residuals of a calibration show."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _run(
     choices = lenses_by_held_out(seen, solved.options) if held_out else None
     page, unmade = files.report_page(args, solved, seen, photographs, diagnosis, choices)
 
-    # Wrong labels that were taken out do no harm, and a noise is estimated.
+    # Wrong labels that were taken out do no harm, and noise is estimated.
     against = [finding for finding in diagnosis.findings if strict or report.is_against(finding)]
     answer = tuple(report.diagnosis_sections(diagnosis, choices, solved.options))
     sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))

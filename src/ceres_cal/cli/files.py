@@ -1,4 +1,4 @@
-"""What commands read and write: files, checked before any long work; results are written all or none."""
+"""Inputs and outputs of commands: files are checked before any long work; results are written all or none."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ def _is_chessboard(text: str) -> bool:
 
 
 def is_board(text: str) -> bool:
-    """Whether a target is spelled as a chessboard, or described as what somebody holds up."""
+    """Whether a target is spelled as a chessboard, or describes a movable target."""
     return _is_chessboard(text) or (is_described(text) and read_target(text, "field").movable)
 
 
 def read_board(text: str) -> scene.Target:
-    """The board of `--board`: COLUMNSxROWSxMM, or described as for `--target`."""
+    """Return the board of `--board`: COLUMNSxROWSxMM, or described as for `--target`."""
     return read_target(text, "board") if is_described(text) else scene.checkerboard(*parse_board(text))
 
 
 def spelled_target(text: str, where: str) -> scene.Target | None:
-    """The target that somebody spelled out, as a chessboard such as 9x6x25mm or as `{"kind": ...}`; None for anything
+    """Return a target that is spelled out, as a chessboard such as 9x6x25mm or as `{"kind": ...}`; None for anything
     else, such as a name or a file.
     """
     if _is_chessboard(text):
@@ -52,14 +52,14 @@ def spelled_target(text: str, where: str) -> scene.Target | None:
 
 
 def require_file_of_targets(text: str, names: Iterable[str]) -> Path:
-    """The file that a target is to be read from; InputError, which says how targets are named, where there is none."""
+    """Return the file to read a target from; InputError, which says how targets are named, if there is none."""
     if Path(text).suffix or Path(text).exists():
         return Path(text)
     raise InputError(f"{no_such('target', text, names)} (or a board such as 9x6x25mm, or a file)")
 
 
 def read_target(text: str, name: str) -> scene.Target:
-    """The target of `--target`: by its name, spelled out, or in a file, alone or as one of that name among several."""
+    """Return the target of `--target`: by name, spelled out, or from a file, alone or by this name among several."""
     if (spelled := spelled_target(text, "--target")) is not None:
         return spelled
     if (known := scene.target_named(text)) is not None:
@@ -80,12 +80,12 @@ def require_shown(
     cameras: Sequence[str] = ("camera",),
     lens: str = "auto",
 ) -> scene.Target | None:
-    """The field that photographs are to show; InputError, before any is searched, where what is said of it, of the
-    board or of the camera cannot be.
+    """Return the field that photographs are to show. Raise InputError, before any photograph is searched, where what is
+    stated of the field, the board or the camera is impossible.
     """
     from ceres_cal.problem import Options, camera_ranges, floor_of, place_ranges
 
-    least = 0.1  # of the picture's diagonal, that a field is large which can be found
+    least = 0.1  # least size of a field that can be found, as a share of the picture's diagonal
     if board is not None:
         detect.finder_of(read_board(board))
     field = None if target is None else read_target(target, "field")
@@ -103,7 +103,7 @@ def require_shown(
 
 
 def json_object(path: Path) -> Mapping[str, Any]:
-    """What a file holds; InputError where it is no JSON object."""
+    """Return the JSON object in a file; InputError where it is none."""
     content = base.parse_json(base.read_bytes(path), str(path))
     if not isinstance(content, dict):
         raise InputError(f"{path}: it must hold one JSON object")
@@ -111,7 +111,7 @@ def json_object(path: Path) -> Mapping[str, Any]:
 
 
 def require_different(files: Iterable[str | Path]) -> None:
-    """A file that counts twice would make its observations look better than they are."""
+    """Raise InputError for a file that is given twice: its observations would seem better than they are."""
     given: set[str] = set()
     for file in files:
         place = os.path.realpath(file)
@@ -121,26 +121,26 @@ def require_different(files: Iterable[str | Path]) -> None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The calibration of a file."""
+    """Load the calibration of a file."""
     from ceres_cal.calibration import Calibration
 
     return Calibration.load(path)
 
 
 def read_observations(paths: Iterable[str | Path]) -> Observations:
-    """All files of observations as one."""
+    """Load and combine files of observations."""
     from ceres_cal.observations import Observations
 
     return observations.combine([Observations.load(path) for path in paths])
 
 
 def station_of(path: Path, station: str | None, calibration: Calibration, camera: str | None = None) -> str:
-    """Name of the station in --station, or of the only one there is in a calibration out of a file, or of --camera."""
+    """Return the name of the station in --station, or of the only one in a calibration from a file, or of --camera."""
     stations = calibration.estimate.stations
     if camera is not None and camera not in calibration.cameras:
         raise InputError(no_such("camera", camera, calibration.cameras))
     if station is not None:
-        calibration.station(station)  # or says which there are
+        calibration.station(station)  # raises InputError that lists the stations
     fitting = [name for name, one in stations.items() if station in (None, name) and camera in (None, one.camera)]
     if station is not None and not fitting:
         raise InputError(f"station {station!r} is of camera {stations[station].camera!r}: leave out --camera")
@@ -153,8 +153,8 @@ def station_of(path: Path, station: str | None, calibration: Calibration, camera
 
 
 def require_output(path: Path | None, inputs: Iterable[str | Path], what: str = "", *endings: str) -> None:
-    """Raise InputError, before any long work, where a result cannot be written or would replace an input, or its ending
-    is none of those that it is written with; `what` such as "the table is".
+    """Raise InputError, before any long work, where a result cannot be written, would replace an input, or has an
+    ending that is not supported; `what` such as "the table is".
     """
     if path is None:
         return
@@ -179,7 +179,7 @@ def require_folder(path: Path) -> None:
 
 @contextmanager
 def folder_of_results(folder: Path) -> Iterator[None]:
-    """A folder, made where it is missing, that what fails leaves behind only where something was written into it."""
+    """Context that creates missing folders, and removes these at the end if nothing was written into them."""
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
     base.make_folder(folder)
     try:
@@ -191,12 +191,12 @@ def folder_of_results(folder: Path) -> Iterator[None]:
 
 
 def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> None:
-    """`require_output` of a file of observations."""
+    """Apply `require_output` to a file of observations."""
     require_output(path, inputs, "observations are", ".json", ".npz")
 
 
 def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
-    """`require_output` of output and report, that they are two files, and that the report is called like a page."""
+    """Apply `require_output` to output and report; they must be two files, and the report must end like a page."""
     require_output(args.output, inputs)
     if (
         args.output is not None
@@ -209,8 +209,10 @@ def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None
 
 @contextmanager
 def finishing() -> Iterator[None]:
-    """Hold Ctrl-C and SIGTERM back while results are written: a command that was interrupted has written nothing."""
-    if threading.current_thread() is not threading.main_thread():  # where Ctrl-C does not arrive
+    """Context in which Ctrl-C and SIGTERM are ignored while results are written: an interrupted command has written
+    nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():  # Ctrl-C does not arrive in other threads
         yield
         return
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -222,7 +224,7 @@ def finishing() -> Iterator[None]:
 
 
 def save(path: Path, made: Any) -> None:
-    """Write a result whole or not at all: bytes, names and values as JSON, or what saves itself."""
+    """Write a result whole or not at all: bytes, a mapping as JSON, or an object that saves itself."""
     with finishing():
         if isinstance(made, bytes):
             base.write_bytes(path, made)
@@ -233,7 +235,7 @@ def save(path: Path, made: Any) -> None:
 
 
 def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> Section:
-    """Write the output by `save`, and the page of the report where there is one; the section names the files."""
+    """Write the output by `save`, and the page of the report if there is one; the section names the files."""
     report = None if page is None else args.report
     with finishing():
         if args.output is not None:
@@ -246,7 +248,8 @@ def write_results(args: ReportArguments, save: Callable[[Path], None], page: str
 
 
 def attempted(what: str, make: Callable[[], T]) -> tuple[T | None, Section]:
-    """What is made once the answer is there. Where that fails the answer stays: the section says so, and is empty else.
+    """Make something after the answer is known. If that fails, the answer is kept and the section reports the failure;
+    otherwise the section is empty.
 
     A command whose section is not empty ends with exit code 1.
     """
@@ -265,13 +268,14 @@ def report_photographs(
     before: Calibration | None = None,
     detected_in: Sequence[Path] = (),
 ) -> report.FramePhotographs | None:
-    """The photographs of `--report PAGE --images FOLDER` that belong to the observations' frames; None without any.
+    """Return the photographs of `--report PAGE --images FOLDER` that belong to the observations' frames; None without
+    any.
 
     Args:
-        detected_in: photographs that the observations were just detected in: a report shows them without being asked.
+        detected_in: photographs in which the observations were just detected: a report shows them without being asked.
 
     Raises:
-        InputError: none of the images is called like a frame, or two that may be the same one.
+        InputError: no image has the name of a frame, or two images have the name of one frame.
     """
     images = image_files(args.images) if args.images else list(detected_in)
     if not images or args.report is None:
@@ -294,7 +298,7 @@ def report_page(
     diagnosis: diagnostics.Diagnosis | None = None,
     choices: Mapping[str, LensChoice] | None = None,
 ) -> tuple[str | None, Section]:
-    """The page that --report asks for, or None; see `attempted`."""
+    """Return the page that --report asks for, or None; see `attempted`."""
     if args.report is None:
         return None, Section()
 
@@ -311,8 +315,8 @@ def calibrated(
     names: Sequence[str],
     *before: Section,
 ) -> Document:
-    """What was calibrated from observations of these names, once it and its report are written; `before`: what is said
-    first.
+    """Write a calibration and its report; return the document on it. `names`: of the observations. `before`: sections
+    that come first.
     """
     page, unmade = report_page(args, calibration, observations, photographs)
     answer = report.calibration_sections(report.quality_of(calibration, observations), names)

@@ -1,5 +1,5 @@
-"""The files and messages of other programs: `ceres-cal export`, `export-table`, `import`, `publish`, `listen` and
-`targets import`.
+"""Files and messages of other programs: `ceres-cal export`, `export-table`, `import`, `publish`, `listen` and `targets
+import`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ceres_cal.report.document import Document, Section
 
 
 def _listed(forms: Iterable[formats.ExportFormat | formats.ImportFormat]) -> str:
-    """What there is to choose from."""
+    """List the formats to choose from."""
     return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
 
 
@@ -43,7 +43,7 @@ def export(
     ),
     options: Mapping[str, str] = options_of(lambda: formats.EXPORT_FORMATS.values()),
 ) -> Document:
-    """A calibration in another format."""
+    """Export a calibration to another format."""
     form = formats.export_format(to)
     if form.endings:
         require_output(output, [calibration])
@@ -68,7 +68,7 @@ export_table = replace(
 def _typed(
     given: Mapping[str, str], forms: Sequence[formats.ExportFormat] | Sequence[formats.ImportFormat]
 ) -> dict[str, Any]:
-    """What was given of the formats' options, of the types that they have."""
+    """Convert the given options of formats to their types."""
     import msgspec
 
     types = {name: kind for form in forms for name, (kind, _) in form.options.items()}
@@ -79,13 +79,13 @@ def _typed(
         try:
             plain = str(parse_length(text, flag(name), "mm")) if name.endswith("_mm") else text
             options[name] = msgspec.convert(plain, types[name], strict=False)
-        except (msgspec.ValidationError, UnicodeEncodeError):  # a word that is no UTF-8 is none of those either
+        except (msgspec.ValidationError, UnicodeEncodeError):  # a word that is not UTF-8 is refused, too
             raise InputError(f"{flag(name)}: {text!r} is not the number or word that it takes") from None
     return options
 
 
 def _losses(exported: formats.Export) -> Iterator[Section]:
-    """What is lost, in px and mm, and what else to know."""
+    """Yield the errors of an export, in px and mm, and its warnings."""
     every = exported.losses
     errors = [
         {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
@@ -113,12 +113,12 @@ def from_option() -> Any:
 
 
 def import_options() -> Any:
-    """The options of the formats that are read."""
+    """The options of the import formats."""
     return options_of(lambda: formats.IMPORT_FORMATS.values())
 
 
 def typed_options(given: Mapping[str, str], form: str | None) -> dict[str, Any]:
-    """What was given of the options of the format that is named, or of any."""
+    """Convert the given options of the named format, or of any."""
     forms = formats.IMPORT_FORMATS.values()
     return _typed(given, [one for one in forms if one.name == form] or list(forms))
 
@@ -158,7 +158,7 @@ def _import(
 
 
 class GroupArguments(Arguments):
-    """Where the league's messages are."""
+    """Multicast group of the league's messages."""
 
     address: str = option("multicast group", "IP", "224.5.23.2")
     port: int = option("", "PORT", 10006, read=whole(1, 65535))

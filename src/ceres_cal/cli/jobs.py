@@ -1,6 +1,6 @@
-"""One job, what came of it, and the file in which that is remembered; and plans, which say what jobs there are.
+"""Jobs of a batch: their outcomes, the file in which outcomes are recorded, and plans, which list the jobs.
 
-Jobs, here or over an executor: each one's outcome as it comes, remembered before it is said.
+Jobs run in this process or in an executor; each outcome is recorded before it is reported.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from ceres_cal.base.files import convert, parse_json, read_bytes
 
 RESULTS = "results.jsonl"
 LEVELS = ("failed", "no", "care", "good")
-"""What needs attention first."""
+"""Levels, in the order of the attention that they need."""
 
 
 class Job(Frozen, eq=True):
     """One command of a plan.
 
     Attributes:
-        name: of its own in the plan; its files are called so. command: such as "calibrate". arguments: as they are
-            typed after it. inputs: files, and folders, that it reads. outputs: files that it writes.
+        name: unique in the plan; its files have this name. command: such as "calibrate".
+        arguments: as they are typed after the command. inputs: files and folders that it reads. outputs: files that it
+            writes.
     """
 
     name: str
@@ -47,7 +48,7 @@ class Job(Frozen, eq=True):
 
     @property
     def key(self) -> str:
-        """Changes with the package's version, the arguments and what the inputs hold.
+        """Digest of the package's version, the arguments and the content of the inputs.
 
         Raises:
             InputError: an input cannot be read.
@@ -58,18 +59,18 @@ class Job(Frozen, eq=True):
 
 
 def _files(inputs: Iterable[Path]) -> list[Path]:
-    """The inputs, and those in a folder, in the order of their names."""
+    """Return the inputs, with folders replaced by their files, sorted by name."""
     inside = (sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path] for path in inputs)
     return [file for files in inside for file in files]
 
 
 class Outcome(Frozen, eq=True):
-    """What came of a job.
+    """Outcome of a job.
 
     Attributes:
-        level: "good", "care" or "no", as verdicts have it; "failed" where there is no answer. line: one line that says
-            it. reasons: further lines. worst_mm: the largest error or move that is named, where there is one.
-        key: of the job as it was then.
+        level: "good", "care" or "no", as in verdicts; "failed" where there is no answer.
+        line: one line of summary. reasons: further lines.
+        worst_mm: largest error or move that is named, if there is one. key: of the job when it ran.
     """
 
     job: str
@@ -81,17 +82,17 @@ class Outcome(Frozen, eq=True):
     key: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "line", printable(self.line))  # which may name a file that is not called in UTF-8
+        object.__setattr__(self, "line", printable(self.line))  # the line may name a file whose name is not UTF-8
         object.__setattr__(self, "reasons", tuple(map(printable, self.reasons)))
 
     @property
     def order(self) -> tuple[int, float, str]:
-        """What needs attention first: by level, then by mm."""
+        """Sort key by the attention needed: level, then mm."""
         return LEVELS.index(self.level), -(self.worst_mm or 0.0), self.job
 
 
 def remembered(folder: Path) -> dict[str, Outcome]:
-    """The last outcome of each job, by the job's name; a line that was cut short is none.
+    """Return the last recorded outcome of each job, by the job's name; a line that is cut short is ignored.
 
     Raises:
         InputError: the file holds something else.
@@ -99,7 +100,7 @@ def remembered(folder: Path) -> dict[str, Outcome]:
     file = folder / RESULTS
     if not file.exists():
         return {}
-    lines = read_bytes(file).split(b"\n")[:-1]  # each ends with its own end
+    lines = read_bytes(file).split(b"\n")[:-1]  # every complete line ends with a line break
     found = [_outcome(line, f"{file}, line {number}") for number, line in enumerate(lines, start=1) if line.strip()]
     return {one.job: one for one in found}
 
@@ -116,7 +117,7 @@ def _outcome(line: bytes, where: str) -> Outcome:
 
 
 def remember(outcome: Outcome, folder: Path) -> None:
-    """Add an outcome to what is remembered, as a whole line."""
+    """Append an outcome to the record, as a whole line."""
     file = folder / RESULTS
     with file.open("ab+") as stream:
         stream.seek(max(stream.tell() - 1, 0))
@@ -128,17 +129,16 @@ def remember(outcome: Outcome, folder: Path) -> None:
 def run_jobs(
     jobs: Sequence[Job], work: Callable[[Job], Outcome], folder: Path, executor: Executor | None = None
 ) -> Iterator[tuple[Outcome, bool]]:
-    """Each job's outcome and whether it is remembered from before, in the order in which they are there.
+    """Yield each job's outcome and whether it was recorded before, in order of completion.
 
-    A job is not done again where its key is the same, its outputs are there and it had an answer. One that fails, with
-    whatever error, is an outcome like the others. Who stops early shuts the executor down: it is the caller's.
+    A job is skipped if its key is unchanged, its outputs exist and it had an answer. A job that fails, with any error,
+    has an outcome, too. A caller that stops early shuts the executor down itself.
 
     Args:
-        work: what a job is done by; picklable, where the executor is of processes. folder: where outcomes are
-            remembered.
+        work: function that does a job; picklable if the executor uses processes. folder: where outcomes are recorded.
 
     Raises:
-        InputError: what is remembered cannot be read.
+        InputError: the record cannot be read.
     """
     known, todo = remembered(folder), []
     for job in jobs:
@@ -177,7 +177,7 @@ def _tried(work: Callable[[Job], Outcome], job: Job) -> Outcome:
 
 
 def failed(job: Job, why: str) -> Outcome:
-    """The outcome of a job without an answer."""
+    """Return the outcome of a job without an answer."""
     return Outcome(job.name, job.command, "failed", " ".join(why.split()))
 
 
@@ -190,7 +190,7 @@ _NAME = re.compile(r"[\w][\w .+-]*")
 
 
 class JobSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One row: a job's name, its command, and arguments as they are typed; files are named from the plan's folder."""
+    """One row: a job's name, its command, and its arguments as typed; file names are relative to the plan's folder."""
 
     name: str
     command: str
@@ -198,14 +198,14 @@ class JobSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_plan(path: Path) -> tuple[JobSpec, ...]:
-    """The rows of a plan.
+    """Read the rows of a plan.
 
     A table has `name`, `command` and `arguments` (one text as it is typed, or a list): a line of JSON each, a CSV with
-    these heads, or TOML with [[job]]. Of a folder each file of observations is calibrated, and those in a folder inside
-    it are taken together.
+    these heads, or TOML with [[job]]. In a folder each file of observations is calibrated, and those in a subfolder are
+    calibrated together.
 
     Raises:
-        InputError: it cannot be read, is empty, or has a row that is none, or one name twice.
+        InputError: it cannot be read, is empty, or has an invalid row or a duplicate name.
     """
     rows = list(_of_folder(path) if path.is_dir() else _of_table(path))
     if not rows:
@@ -228,7 +228,9 @@ def _of_folder(folder: Path) -> Iterator[JobSpec]:
 
 
 def _holds_observations(file: Path) -> bool:
-    """By its ending, and of JSON by its first letters: calibrations and truths lie beside."""
+    """Whether a file holds observations, by its ending, and for JSON by its beginning: calibrations and truths may lie
+    beside.
+    """
     first = 1000  # bytes
     if file.suffix not in _OBSERVATIONS or not file.is_file():
         return False
@@ -255,7 +257,7 @@ def _of_table(path: Path) -> Iterator[JobSpec]:
 
 
 def words_of(typed: str, where: str) -> list[str]:
-    """Arguments as a shell takes them apart."""
+    """Split arguments as a shell does."""
     try:
         return shlex.split(typed)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""`ceres-cal join`: the observations of a rig's cameras as one file, with frames and labels that go together."""
+"""`ceres-cal join`: the observations of a rig's cameras in one file, with consistent frames and labels."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _run(
 
 
 def _moments(observations: Observations) -> Counter[int]:
-    """How many moments so many cameras saw."""
+    """Number of moments by the number of cameras that saw them."""
     cameras: dict[str, set[str]] = {}
     for view in observations.views:
         cameras.setdefault(view.frame, set()).add(view.camera)

@@ -1,4 +1,4 @@
-"""`ceres-cal locate` and `ceres-cal project`: use a calibration, from pixels to metres and back."""
+"""`ceres-cal locate` and `ceres-cal project`: use of a calibration, from pixels to metres and back."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _rows_argument(rows: str, example: str) -> Any:
 
 
 class PlacesArguments(Arguments):
-    """A calibration, and where else its places or pixels come from."""
+    """A calibration, and the file from which places or pixels may come."""
 
     calibration: Path = calibration_argument()
     file: str | None = option("read lines of these from a file instead", "CSV")
@@ -47,7 +47,7 @@ def _locate(
     height = metres(height_mm)
     name, camera = _station(args)
     inside = scene.in_image(pixels, camera.image_size)
-    points = np.where(inside[:, None], camera.locate(pixels, height), np.nan)  # beyond nothing was ever measured
+    points = np.where(inside[:, None], camera.locate(pixels, height), np.nan)  # the lens is unknown outside the image
     lost = {row: _why_not_located(camera, pixels[row], height) for row in _rows_without_answer(points)}
     data = {"station": name, "height_m": height, "pixels": pixels.tolist()}
     return _answer({**data, "points_m": _or_null(points)}, points, lost)
@@ -75,7 +75,7 @@ def _station(args: PlacesArguments) -> tuple[str, scene.Camera]:
 
 
 def _read_rows(given: Sequence[str], file: str | None, sizes: tuple[int, ...]) -> base.Array:
-    """(N, largest size) numbers from the arguments, a file or standard input; a number left out is 0."""
+    """(N, largest size) numbers from the arguments, a file or standard input; a missing number is 0."""
     import numpy as np
 
     rows = [_numbers(text, sizes, where) for where, text in _texts(given, file)]
@@ -85,7 +85,7 @@ def _read_rows(given: Sequence[str], file: str | None, sizes: tuple[int, ...]) -
 
 
 def _texts(given: Sequence[str], file: str | None) -> Iterator[tuple[str, str]]:
-    """What to read numbers from, each with how messages name it."""
+    """Yield the texts to read numbers from, each with its name in messages."""
     if file is not None and given:
         raise InputError("give places as arguments or by --file, not both")
     if file == "-" or tuple(given) == ("-",):
@@ -97,13 +97,13 @@ def _texts(given: Sequence[str], file: str | None) -> Iterator[tuple[str, str]]:
 
 
 def _places(arguments: Iterable[str]) -> list[str]:
-    """A text for each place, wherever spaces stand: 640,480 or 640, 480 or 640 480; several places need commas."""
+    """Return a text for each place, wherever spaces are: 640,480 or 640, 480 or 640 480; several places need commas."""
     typed = re.sub(r"\s*,\s*", ",", " ".join(arguments)).split()
     return typed if any("," in text for text in typed) else [" ".join(typed)] if typed else []
 
 
 def _lines(lines: Iterable[str], where: str) -> Iterator[tuple[str, str]]:
-    """The lines that hold numbers: not the empty ones, not comments (#), and not a header of names."""
+    """Yield the lines with numbers: without empty lines, comments (#), and a header of names."""
     for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].strip()
         is_header = number == 1 and all(part.strip().isidentifier() for part in re.split("[,;\t]", text))
@@ -112,7 +112,7 @@ def _lines(lines: Iterable[str], where: str) -> Iterator[tuple[str, str]]:
 
 
 def _numbers(text: str, sizes: tuple[int, ...], where: str) -> list[float]:
-    if ";" in text:  # as spreadsheets write where decimals have a comma
+    if ";" in text:  # as in spreadsheets with decimal commas
         text = text.replace(",", ".").replace(";", ",")
     parts = text.split(",") if "," in text else text.split()
     if len(parts) not in sizes:

@@ -1,6 +1,6 @@
-"""What has become of a camera? `ceres-cal check`, `score`, `audit` and `compare`: it is held against new observations
-or another calibration; exit code 0 yes, 1 no, so that cron may ask. And after a move `refit`: the poses anew from few
-observations and all that was known.
+"""Whether a camera is still as calibrated: `ceres-cal check`, `score`, `audit` and `compare` compare it with new
+observations or another calibration; the exit code is 0 for yes and 1 for no, for use in cron. After a move `refit`
+estimates new poses from few observations and all prior knowledge.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _score(
 
 
 def _scored(answer: moves.Agreements, before: Calibration) -> Document:
-    most_views = 3  # shown
+    most_views = 3  # number of views that are shown
     cameras = list(answer.values())
     views = sorted((view for one in cameras for view in one.views), key=lambda view: -view.misfit.all_rms_px)
     posed = cameras[0].solution
@@ -347,7 +347,7 @@ class RefitArguments(InputArguments, arguments.ReportArguments):
 )
 def _refit(args: RefitArguments) -> Document:
     images = photographs_in(args)
-    # To replace the old calibration is what many want.
+    # The output may replace the old calibration, as many users want.
     files.require_outputs(args, images or args.inputs)
     calibration = files.read_calibration(args.calibration)
     observed = None if images else files.read_observations(args.inputs)

@@ -1,4 +1,4 @@
-"""`ceres-cal open`: photographs and their calibration in the browser, to be seen, dragged and trusted."""
+"""`ceres-cal open`: photographs and their calibration in the browser, to see, drag and check."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _serve(session: cli.Session, port: int, browser: bool) -> None:
 
 
 def _sitting(files: Sequence[str], folder: Path, target: str) -> cli.PageContext:
-    """What was named, each file once: nothing else is read later."""
+    """Return the named files, each once: no other file is read later."""
     most_calibrations = 2
 
     named = image_files(files)

@@ -1,4 +1,4 @@
-"""The commands that a state of the page stands for, as one would type them, and the files that they need."""
+"""Commands equivalent to a state of the page, as one would type them, and the files that they need."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def make(
     """Detect and calibrate into a folder, by the commands.
 
     Args:
-        auto: without a start. known: what was made before of this state: its observations are written again, and a
-            report and exports, too.
+        auto: without an initial estimate.
+        known: earlier results for this state: its observations are written again, together with a report and exports.
 
     Raises:
-        CalibrationError: what a command raises, or there is nothing to look for.
+        CalibrationError: as raised by a command, or there is nothing to look for.
     """
     write_inputs(state, sitting, folder, auto=auto)
     done: list[PageStep] = []
@@ -62,7 +62,8 @@ def make(
         done.append(step)
         if known is None:
             return step.answer().data["found"]
-        return write_bytes(step.output, known.observed[step.output.name])  # what it wrote when the lines were found
+        # what the command wrote when the lines were found
+        return write_bytes(step.output, known.observed[step.output.name])
 
     if state.board:
         boards = tuple(map(Path, observe(board_step(state, sitting, folder)) or boards))
@@ -81,7 +82,7 @@ def make(
 
 
 def board_step(state: State, sitting: PageContext, folder: Path) -> PageStep:
-    """Boards in all photographs."""
+    """Return the detection of boards in all photographs."""
     output = folder / "board.json"
     words = [*arguments.board_words(state.board), "--camera", CAMERA, "-o", str(output)]
     return PageStep("detect board", (*map(str, sitting.photographs), *words), output)
@@ -90,7 +91,7 @@ def board_step(state: State, sitting: PageContext, folder: Path) -> PageStep:
 def field_steps(
     state: State, target: Target, sitting: PageContext, folder: Path, boards: Collection[Path], *, auto: bool
 ) -> Iterator[PageStep]:
-    """The field in the photographs that show no board: those with a mask of their own one by one.
+    """Yield the detection of the field in photographs without a board; those with a mask of their own one by one.
 
     Raises:
         InputError: there is nothing to start from, or no photograph is left.
@@ -119,12 +120,13 @@ def field_steps(
         if group[0].name in masked:
             words += ["--mask", str(folder / _mask_name(group[0]))]
         output = folder / (f"field-{number}.json" if number > 1 else "field.json")
-        words += [] if sitting.start is not None else ["--camera", CAMERA]  # else by the names of the calibration
+        # otherwise the names of the calibration are used
+        words += [] if sitting.start is not None else ["--camera", CAMERA]
         yield PageStep("detect field", (*map(str, group), *words, "-o", str(output)), output)
 
 
 def calibrate_step(state: State, observed: Sequence[Path], folder: Path, report: bool) -> PageStep:
-    """One calibration of all that was observed."""
+    """Return one calibration of all observations."""
     priors = arguments.repeated("--prior", state.priors)
     lengths = ["--estimate", ",".join(state.solved)] if state.solved else []
     page = ["--report", str(folder / "report.html")] if report else []
@@ -133,7 +135,7 @@ def calibrate_step(state: State, observed: Sequence[Path], folder: Path, report:
 
 
 def export_steps(state: State, folder: Path) -> Iterator[PageStep]:
-    """Each format that was chosen."""
+    """Yield the export to each format that was chosen."""
     for name in state.exports:
         output = folder / f"{name}{(export_format(name).endings or ('',))[0]}"
         yield PageStep("export", (str(folder / "calibration.json"), "--to", name, "-o", str(output)), output)
@@ -143,7 +145,7 @@ def export_steps(state: State, folder: Path) -> Iterator[PageStep]:
 
 
 def write_inputs(state: State, sitting: PageContext, folder: Path, *, auto: bool) -> None:
-    """Clicks and masks as files that the commands take."""
+    """Write clicks and masks as files for the commands."""
     if not auto and len(state.points) >= FEWEST:
         points = {name: (one.x, one.y) for name, one in state.points.items()}
         curves = [(one.curve, one.x, one.y) for one in state.places]
@@ -160,7 +162,7 @@ def _mask_name(path: Path) -> str:
 
 
 def _mask(regions: Sequence[Region], size: tuple[int, int]) -> bytes:
-    """A picture, black where nothing of the field is."""
+    """Return a picture that is black where nothing of the field is."""
     black, white = 0, 255
     picture = np.full(size[::-1], white, np.uint8)
     for one in regions:

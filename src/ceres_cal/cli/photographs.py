@@ -1,6 +1,7 @@
-"""What commands do with photographs and videos: take them beside observations, make one of many, and detect in time.
+"""Photographs and videos as inputs of commands: beside observations, merged into one picture, and detection with a time
+limit.
 
-`ceres-cal detect board` and `detect rings`: from images to observations.
+Also `ceres-cal detect board` and `detect rings`: from images to observations.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _OBSERVATIONS = (".json", ".npz")
 
 
 class InputArguments(QuietArguments):
-    """A calibration, files of observations or photographs, and what is to be said of photographs."""
+    """A calibration, files of observations or photographs, and settings for photographs."""
 
     calibration: Path = arguments.calibration_argument("the calibration from before")
     inputs: tuple[str, ...] = argument(
@@ -35,7 +36,7 @@ class InputArguments(QuietArguments):
 
 
 class DetectArguments(Arguments):
-    """What `detect board` and `detect rings` share."""
+    """Arguments that `detect board` and `detect rings` share."""
 
     timeout: float | None = arguments.timeout_option()
     camera: str = arguments.camera_option()
@@ -44,7 +45,7 @@ class DetectArguments(Arguments):
 
 
 def photographs_in(args: InputArguments) -> list[Path]:
-    """The photographs that are named, each once; none where observations are."""
+    """Return the photographs that are named, each once; empty if observations are named."""
     observed = [name for name in args.inputs if Path(name).suffix.lower() in _OBSERVATIONS]
     if len(observed) == len(args.inputs):
         require_different(observed)
@@ -62,7 +63,7 @@ def photographs_in(args: InputArguments) -> list[Path]:
 
 
 def shown(detections: detect.KnownDetections | None) -> Section:
-    """What photographs showed; nothing where none were given."""
+    """Section on what photographs showed; empty where none were given."""
     if detections is None:
         return Section()
     missed = missed_section(detections.missed)
@@ -73,13 +74,13 @@ def shown(detections: detect.KnownDetections | None) -> Section:
 
 
 def missed_section(missed: tuple[tuple[str, str], ...]) -> Section:
-    """Images in which nothing was detected, a line each."""
+    """Section with a line for each image in which nothing was detected."""
     data = {"missed": [{"image": path, "reason": reason} for path, reason in missed]}
     return Section("", [f"{path}: {reason}" for path, reason in missed], data)
 
 
 def turned_section(paths: Iterable[Path]) -> Section:
-    """Photographs and videos that viewers show turned, a line each."""
+    """Section with a line for each photograph and video that viewers show turned."""
     words = ((path, detect.turned_words(path)) for path in dict.fromkeys(paths))
     said = [f"{path}: {one}: --facing and pixels refer to the picture as stored" for path, one in words if one]
     return Section("warning", said)
@@ -89,7 +90,7 @@ def turned_section(paths: Iterable[Path]) -> Section:
 
 
 def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
-    """What `detect` returns; InputError where it takes longer than --timeout."""
+    """Return the result of `detect`; InputError where it takes longer than --timeout."""
     if timeout is not None and not timeout > 0.0:
         raise InputError(f"--timeout must be above 0 seconds, not {timeout:g}")
 
@@ -105,14 +106,15 @@ def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
 
 
 def median_path(output: Path, inputs: Sequence[Path]) -> Path:
-    """Where the one picture is written, beside the observations; InputError where that is one of the inputs."""
+    """Return where the one picture is written, beside the observations; InputError where that is one of the inputs."""
     path = output.with_name(f"{output.stem}_median.png")
     require_output(path, inputs)
     return path
 
 
 def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> dict[str, Any]:
-    """Write the one picture of photographs and videos, in 16 bits; what became of each of them, for --json.
+    """Write the one picture made from photographs and videos, in 16 bits; return which were used and left out, for
+    --json.
 
     Raises:
         InputError: see `detect.median.merged`; an image or a video that cannot be read.
@@ -137,7 +139,7 @@ def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) 
 
 
 def median_text(data: dict[str, Any]) -> str:
-    """What became of the pictures, in one line."""
+    """Summarise in one line which pictures were used."""
     used, left_out = len(data["used"]), data["left_out"]
     reasons: dict[str, list[str]] = {}
     for one in left_out:
@@ -233,7 +235,7 @@ def _board(args: BoardArguments) -> scene.Target:
     if args.charuco is not None:
         if args.square is None:
             raise InputError("--charuco is for a board of squares: give --square M")
-        marker_m = args.marker or 0.0  # which comes with it
+        marker_m = args.marker or 0.0  # required beside --charuco
         return scene.charuco(args.columns, args.rows, args.square, marker_m, args.charuco, legacy=args.legacy)
     if args.square is not None:
         return scene.checkerboard(args.columns, args.rows, args.square)

@@ -24,7 +24,7 @@ _BLANK = Section("", [""])
 
 
 class RunArguments(QuietArguments):
-    """What there is, and what is to come of it."""
+    """Inputs, and which results are wanted."""
 
     images: tuple[str, ...] = argument(
         "IMAGE",
@@ -53,7 +53,7 @@ class RunArguments(QuietArguments):
 
 
 class _Step(Frozen, eq=True):
-    """A command as one would type it, what is worth showing of its answer, that answer, and its exit code."""
+    """A command as one would type it, the lines of its answer to show, the answer's data, and its exit code."""
 
     command: str
     lines: Sequence[str]
@@ -71,11 +71,11 @@ class _Step(Frozen, eq=True):
 )
 def _run(args: RunArguments) -> Document:
     of_field = args.board or args.facing or args.not_painted or args.estimate
-    if args.target is not None and is_board(args.target) and not of_field:  # a board is a target to other commands
+    if args.target is not None and is_board(args.target) and not of_field:  # other commands take a board as a target
         args = replace(args, board=args.target, target=None)
     cameras = _cameras(args)
     _require_fitting(args, cameras)
-    forms = [formats.export_format(name) for name in args.to]  # or says which there are
+    forms = [formats.export_format(name) for name in args.to]  # raises InputError that lists the formats
     several = len(cameras) > 1
     with ExitStack() as folders:
         for one in (args, *cameras):
@@ -94,7 +94,7 @@ def _run(args: RunArguments) -> Document:
     steps.append(calibrated)
     if level != "good" and args.target is not None:
         maps = (calibrated.data["uncertainty"] or {}).get("maps", {})
-        least = max(maps, key=lambda name: maps[name][-1]["worst_sd_mm"], default="")  # known, of several
+        least = max(maps, key=lambda name: maps[name][-1]["worst_sd_mm"], default="")  # least known of several stations
         of_one = ["--station", least] if len(maps) > 1 else []
         steps.append(_attempted(args, "advise", [str(args.output / "calibration.json"), *of_one], most=2))
     asked = [calibrated]
@@ -109,7 +109,7 @@ def _run(args: RunArguments) -> Document:
 
 
 def _cameras(args: RunArguments) -> list[RunArguments]:
-    """What is asked for of each camera: of the one that there is, or that is named, or of each that has a folder."""
+    """Return the arguments for each camera: the only or named one, or one for each folder or video."""
     shown, is_named = each_camera(args.images), args.camera != RunArguments.camera
     if not shown or (is_named and len(args.images) > 1):
         return [args]
@@ -135,7 +135,7 @@ def _cameras(args: RunArguments) -> list[RunArguments]:
 
 
 def _require_tied(cameras: Sequence[RunArguments], seen: Sequence[Sequence[_Step]]) -> None:
-    """Raise InputError for folders of boards alone beside folders of the field alone: nothing ties their cameras."""
+    """Raise InputError if some folders show only boards and others only the field: nothing relates their cameras."""
     shown = [{Path(step.data["output"]).stem for step in own if "output" in step.data} for own in seen]
     alone = {kind: one.camera for kinds, one in zip(shown, cameras, strict=True) if len(kinds) == 1 for kind in kinds}
     if len(alone) > 1 and all(len(kinds) == 1 for kinds in shown):
@@ -146,7 +146,7 @@ def _require_tied(cameras: Sequence[RunArguments], seen: Sequence[Sequence[_Step
 
 
 def _require_fitting(args: RunArguments, cameras: Sequence[RunArguments]) -> None:
-    """Raise InputError, before any photograph is read, for names, sizes and units that no later step would take."""
+    """Raise InputError, before any photograph is read, for names, sizes and units that a later step would refuse."""
     from ceres_cal.functions import lines_to_find
 
     if args.target is None and args.board is None:
@@ -172,7 +172,7 @@ def _step(
     most: int | None = None,
     titles: Collection[str] | None = None,
 ) -> _Step:
-    """Run a command and keep the first lines of what it says, and the images that showed nothing."""
+    """Run a command; keep the first lines of its answer, and the images that showed nothing."""
     typed = COMMANDS[name].typed(arguments)
     with ProgressBar(args.silent) as bar:
         bar.say(f"now       {_short(typed)}")
@@ -186,20 +186,20 @@ def _step(
 
 
 def _attempted(args: RunArguments, name: str, arguments: Sequence[str], most: int | None = None) -> _Step:
-    """A step after the calibration is there; without data where it fails: the calibration stays."""
+    """Run a step after the calibration is made; without data where it fails, since the calibration remains valid."""
     step, unmade = attempted("advice" if name == "advise" else name, lambda: _step(args, name, arguments, most))
     return step or _Step(COMMANDS[name].typed(arguments), tuple(unmade.shown()), {}, 1)
 
 
 def _photographs(args: RunArguments) -> list[Path]:
-    """The photographs that were given, and those taken out of a video."""
+    """Return the given photographs, and those taken from videos."""
     images, videos = images_and_videos(args.images)
     with ProgressBar(args.silent) as bar:
         return [*images, *detect.frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 
 def _seen_by(args: RunArguments, images: list[Path], is_one_of_several: bool) -> list[_Step]:
-    """What a camera observed; of several an error says which one is to be turned."""
+    """Return what a camera observed; if there are several cameras, an error names the one to turn."""
     try:
         return list(_observed(args, images, is_one_of_several))
     except InputError as error:  # reads: "..., such as --facing left.LeftGoalLine=left, ..."
@@ -209,7 +209,9 @@ def _seen_by(args: RunArguments, images: list[Path], is_one_of_several: bool) ->
 
 
 def _observed(args: RunArguments, images: list[Path], is_one_of_several: bool) -> Iterator[_Step]:
-    """Boards first; what shows none may show the field. One of several cameras may see boards alone."""
+    """Yield the steps: boards first; photographs without a board may show the field. One of several cameras may see
+    boards only.
+    """
     rest = [str(path) for path in images]
     if args.board is not None:
         goal = ["--camera", args.camera, "-o", str(args.output / "board.json")]
@@ -217,7 +219,8 @@ def _observed(args: RunArguments, images: list[Path], is_one_of_several: bool) -
         try:
             found = _step(args, "detect board", asked, most=1)
             rest = [path for path in rest if path not in found.data["found"]]
-            yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
+            # the others may show the field
+            yield found if args.target is None else replace(found, lines=found.lines[:1])
         except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:
                 raise
@@ -230,13 +233,13 @@ def _observed(args: RunArguments, images: list[Path], is_one_of_several: bool) -
         said = [*arguments.repeated("--facing", args.facing), *arguments.repeated("--estimate", args.estimate)]
         said += ["--not-painted", args.not_painted] if args.not_painted else []
         goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
-        still = [] if images_and_videos(args.images)[0] else ["--median"]  # of videos alone
+        still = [] if images_and_videos(args.images)[0] else ["--median"]  # for videos only
         asked = [*rest, *still, "--target", args.target, "--auto", *said, *goal]
         yield _step(args, "detect field", asked, most=1)
 
 
 def _is_named_by_chance(board: str | None) -> bool:
-    """Whether a board looks the same turned by half a turn, so that each camera may name its corners otherwise."""
+    """Whether a board looks the same when turned by half a turn, so that cameras may name its corners differently."""
     return board is not None and len(start.symmetries(read_board(board))) > 1
 
 
@@ -256,7 +259,7 @@ def _calibrated(
 
 
 def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: formats.ExportFormat) -> Iterator[_Step]:
-    """One file, or one for each camera where the format does not hold so many."""
+    """Yield one export, or one for each camera if the format does not hold so many."""
     ending = (form.endings or ("",))[0]
     asked = [str(args.output / "calibration.json"), "--to", form.name]
     if form.holds(len(cameras)):
@@ -286,7 +289,7 @@ def _sections(args: RunArguments, images: int, steps: Sequence[_Step], level: st
 
 
 def _short(command: str) -> str:
-    """A command with the first of its photographs only, and of the options that name the others."""
+    """Shorten a command to the first of its photographs, and leave out options that name the others."""
     words = shlex.split(command)
     places = [place for place, word in enumerate(words) if Path(word).suffix.lower() in IMAGE_ENDINGS]
     if len(places) <= _MOST_NAMES:

@@ -1,4 +1,6 @@
-"""`ceres_cal.run`: the command as a function. By itself, since every `--help` reads the commands and needs no NumPy."""
+"""`ceres_cal.run`: the command as a function. It has a module of its own, since `--help` reads the commands without
+NumPy.
+"""
 
 from __future__ import annotations
 
@@ -33,17 +35,18 @@ def run(
     """Calibrate one camera or several from photographs or videos in one call, as `ceres-cal run` does.
 
     Args:
-        images: photographs of one camera, a folder of them, or a video; of several cameras a folder or a video for
-            each, or the folder that these are in. output: folder for everything that is made.
+        images: photographs of one camera, a folder of them, or a video; for several cameras a folder or a video each,
+            or the folder that contains these. output: folder for all results.
         target: the field, such as `ssl_field("B")` or "ssl-b". board: such as "9x6x25mm", or a target of circles or
             AprilTags.
-        facing: which way round the field is, such as {"LeftGoalLine": "top"}, of several cameras
-            {"left.LeftGoalLine": "top"}. not_painted: lines that it lacks.
-        lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to solve for.
-        to: formats to export to. frames: how many photographs to take out of a video.
+        facing: which way round the field is, such as {"LeftGoalLine": "top"}; for several cameras {"left.LeftGoalLine":
+            "top"}. not_painted: lines that it lacks.
+        lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to estimate.
+        camera: name of the camera. to: formats to export to. frames: number of photographs to take from a video.
 
     Raises:
-        InputError: an argument does not fit, or no photograph shows the target. SolutionError: no usable camera.
+        InputError: an argument does not fit, or no photograph shows the target.
+        SolutionError: no usable camera.
     """
     given = RunArguments(
         images=(str(images),) if isinstance(images, str | PathLike) else tuple(map(str, images)),

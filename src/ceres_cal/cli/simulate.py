@@ -1,4 +1,4 @@
-"""`ceres-cal simulate`: observations whose truth is known, to try things on."""
+"""`ceres-cal simulate`: simulated observations with known truth, for experiments."""
 
 from __future__ import annotations
 

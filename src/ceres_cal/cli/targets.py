@@ -83,7 +83,7 @@ def _targets(wanted: str) -> dict[str, scene.Target]:
 
 
 def _targets_in(path: Path) -> dict[str, scene.Target]:
-    """The targets of a file of observations, even where its observations are at fault."""
+    """Return the targets of a file of observations, even if its observations are invalid."""
     from ceres_cal.observations import Observations
 
     if path.suffix == ".npz":
@@ -122,7 +122,7 @@ def _item(title: str, text: str) -> str:
 def _target_text(name: str, target: scene.Target) -> str:
     import json
 
-    spec = {key: value for key, value in target.spec.items() if key not in _FEATURES}  # those follow
+    spec = {key: value for key, value in target.spec.items() if key not in _FEATURES}  # listed below
     lines = [f"{name} {json.dumps(spec)}"]
     width = max(map(len, (*target.points, *target.curves)))
     if target.points:
@@ -156,7 +156,7 @@ def _kind_data(kind: scene.TargetKind) -> dict[str, Any]:
 
 
 def _target_data(target: scene.Target) -> dict[str, Any]:
-    """Its description, and all its features as a custom target's file has them."""
+    """Return a target's description, and all its features in the form of a custom target's file."""
     features = {**scene.custom(target.points, target.curves).spec}
     del features["kind"]
     return {"spec": target.spec, **features}

@@ -1,9 +1,9 @@
-"""What a terminal shows: colour, where NO_COLOR does not say otherwise, and progress on standard error.
+"""Output to a terminal: colour, unless NO_COLOR forbids it, and progress on standard error.
 
-Progress is a bar on a terminal, now and then a line elsewhere, nothing where it is not wanted. Colour is for titles,
+Progress is a bar on a terminal, occasional lines elsewhere, and nothing where it is not wanted. Colour marks titles,
 warnings, and whether the answer is good.
 
-The commands as a program of their own: which one is typed, its signals, its streams, what a failure says, its end.
+Also the commands as a program: the choice of the command, signals, streams, error messages and exit.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _ANSWERS = (
 
 
 def in_colour(stream: TextIO) -> bool:
-    """Whether a stream shows colours and nobody asked for none (no-color.org)."""
+    """Whether a stream shows colours and no environment variable forbids them (no-color.org)."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def coloured(text: str) -> str:
-    """The text of an answer."""
+    """Colour the text of an answer."""
     for colour, answer in _ANSWERS:
         text = answer.sub(rf"{colour}\g<0>{_PLAIN}", text)
     return _TITLE.sub(_title, text)
@@ -59,18 +59,18 @@ def _title(found: re.Match[str]) -> str:
 
 
 class ProgressBar:
-    """How far some long work is. A context: the bar is gone when it ends, however it ends.
+    """Progress of long work. Used as a context, it removes the bar at the end in any case.
 
     Args:
         silent: show nothing.
-        stream: where; standard error by default.
-        clock: seconds.
+        stream: where to show it; standard error by default.
+        clock: current time in seconds.
     """
 
     def __init__(
         self, silent: bool, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        first_line_s = 3.0  # where there is no terminal; each further line waits twice as long
+        first_line_s = 3.0  # without a terminal; the interval doubles with each line
         redraw_s = 0.1
         self._stream = sys.stderr if stream is None else stream
         self._silent, self._clock = silent, clock
@@ -88,12 +88,12 @@ class ProgressBar:
             self._write(_CLEAR)
 
     def say(self, text: str) -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         if not self._silent:
             self._write(f"{_CLEAR if self._terminal else ''}{text}\n")
 
     def update(self, done: int, total: int, note: str) -> None:
-        """Show that `done` of `total` steps are done, 0 where nobody knows; `note` says what is going on."""
+        """Show that `done` of `total` steps are done, total 0 if it is unknown; `note` describes the current work."""
         now = self._clock()
         if self._silent or now < self._due:
             return
@@ -119,17 +119,17 @@ def _bar(done: int, total: int) -> str:
 
 
 TERMINATED = 143
-"""What a shell reports of a program that SIGTERM ended."""
+"""Exit code that a shell reports for a program ended by SIGTERM."""
 
 
 class Termination(KeyboardInterrupt):
-    """SIGTERM came: everything is left as by Ctrl-C."""
+    """SIGTERM arrived: the program ends as by Ctrl-C."""
 
 
 class _SafeStream(io.FileIO):
     """A standard stream that never fails: what cannot be written is lost, and `lost` says why.
 
-    So the exit code of a command is that of its work, wherever its words go.
+    So the exit code of a command depends on its work alone, not on its output.
     """
 
     lost: OSError | None = None
@@ -139,22 +139,23 @@ class _SafeStream(io.FileIO):
             while self.lost is None:
                 if (written := super().write(content)) is not None:
                     return written
-                select([], [self], [])  # a pipe that does not block, and is full
+                select([], [self], [])  # a non-blocking pipe that is full
         except OSError as error:  # reads: "the answer is not on standard output: ..."
             self.lost = error
         return len(content)
 
 
 def as_a_program() -> None:
-    """Take SIGTERM like Ctrl-C, print whatever a name holds wherever it goes, and let nobody but us write on standard
+    """Treat SIGTERM like Ctrl-C, make any name printable on any stream, and keep libraries from writing to standard
     error.
     """
-    # Between collections: `calibrate` imports and makes half of that, no garbage, and looking it through takes 20 ms.
+    # Allocations between garbage collections: `calibrate` makes half as many objects, none of them garbage, and a
+    # collection takes 20 ms.
     objects = 100_000
     signal.signal(signal.SIGTERM, _terminate)
     gc.set_threshold(objects)
     for threads in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
-        os.environ.setdefault(threads, "1")  # to begin others, which bring little (base.threads), takes time
+        os.environ.setdefault(threads, "1")  # starting other threads, which gain little (base.threads), takes time
     _open_what_is_closed()
     error = 2
     if not os.environ.get("CERES_CAL_DEBUG"):
@@ -164,14 +165,14 @@ def as_a_program() -> None:
 
 
 def _open_what_is_closed() -> None:
-    """Or the next file that is opened is written on as standard output, or standard error."""
+    """Open closed standard descriptors; otherwise the next opened file would receive standard output or error."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
 
 
 def _stream(number: int, before: TextIO | None) -> TextIO:
-    """A descriptor as a stream like the one before, or like any where there was none."""
+    """Make a stream of a descriptor, like the one before, or a usual one if there was none."""
     encoding = "utf-8" if before is None else before.encoding
     buffered = io.BufferedWriter(_SafeStream(number, "w", closefd=False))
     by_lines = number != 1 or os.isatty(number)
@@ -183,31 +184,31 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _silence_libraries() -> None:
-    """What image libraries and solvers print on descriptor 2 goes nowhere."""
+    """Discard what image libraries and solvers print on descriptor 2."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     os.close(nowhere)
 
 
 def ended(exit_code: int) -> int:
-    """The process ends here, after all that was to be done at its end; Python would take its objects apart one by one,
-    which takes as long as many a solve, and wait for native work that was left to itself.
+    """End the process after all exit functions. Python would destroy its objects one by one, which takes as long as
+    many a solve, and wait for abandoned native work.
     """
-    if os.environ.get("CERES_CAL_DEBUG"):  # a profiler wants its say
+    if os.environ.get("CERES_CAL_DEBUG"):  # a profiler needs a normal exit
         return exit_code
     native = sys.modules.get("ceres_cal.base.threads")
     if native is None or not native.is_busy():
         atexit._run_exitfuncs()
     sys.stdout.flush()
     lost = cast(_SafeStream, cast(io.BufferedWriter, sys.stdout.buffer).raw).lost
-    if lost is not None and not isinstance(lost, BrokenPipeError):  # who closes a pipe wants no more
+    if lost is not None and not isinstance(lost, BrokenPipeError):  # a closed pipe means that no more output is wanted
         print(f"ceres-cal: the answer is not on standard output: {lost.strerror}", file=sys.stderr)
     sys.stderr.flush()
     os._exit(exit_code)
 
 
 def print_answer(answer: Document, *, as_json: bool, quiet: bool = False) -> None:
-    """Print an answer; with --quiet its one line."""
+    """Print an answer; with --quiet only its one line."""
     if quiet and not as_json:
         print(answer.one_line)
     elif as_json:
@@ -227,14 +228,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
     Args:
-        arguments: those of the command line by default.
+        arguments: by default those of the command line.
 
     Returns:
-        0 success, 1 the answer is no or a part of it could not be made, 2 bad usage or input, 3 no usable solution,
-        130 interrupted, 143 terminated.
-        It says how the work ended, whether or not its words could be written. Every failure is one line on standard
-        error, with --json also an object on standard output; with CERES_CAL_DEBUG set an unexpected one is raised
-        instead.
+        0 success, 1 the answer is no or a part of it could not be made, 2 bad usage or input, 3 no usable solution, 130
+            interrupted, 143 terminated.
+        The code describes the work, whether or not its output could be written. Every failure is one line on standard
+            error, with --json also an object on standard output; with CERES_CAL_DEBUG set an unexpected one is raised
+            instead.
     """
     if arguments is not None:
         return _answer(list(arguments))
@@ -243,7 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _answer(arguments: list[str]) -> int:
-    """Run one command; the exit code, whatever happens."""
+    """Run one command; return its exit code in any case."""
     with noting():
         try:
             return _run(arguments)
@@ -256,10 +257,10 @@ def _answer(arguments: list[str]) -> int:
 
 
 def _words(error: BaseException) -> tuple[str, int]:
-    """What is said of an error, and the exit code."""
-    interrupted = 130  # what a shell reports of a program that SIGINT ended
-    most_letters = 200  # of an error that nobody wrote for people
-    if isinstance(error.__cause__, KeyboardInterrupt):  # a library that was being loaded makes an ImportError of it
+    """Return the message for an error, and the exit code."""
+    interrupted = 130  # exit code that a shell reports for a program ended by SIGINT
+    most_letters = 200  # largest length of an error that was not written for users
+    if isinstance(error.__cause__, KeyboardInterrupt):  # an interrupted import raises an ImportError instead
         error = error.__cause__
     match error:
         case CalibrationError():
@@ -305,7 +306,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def chosen(arguments: list[str]) -> tuple[Command, list[str]]:
-    """The command that is typed, and its arguments; InputError where there is none of its name."""
+    """Return the command that is typed, and its arguments; InputError if there is no such command."""
     for words in (2, 1):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:

@@ -1,4 +1,4 @@
-"""`ceres-cal undistort`: straight images, top views to scale, and the model drawn into photographs."""
+"""`ceres-cal undistort`: straight images, top views to scale, and photographs with the model drawn into them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STRAIGHT = "straight images (default)"
 _TOP = "the field from above"
 _OVERLAY = "the model in the photograph"
 Area = tuple[float, float, float, float]
-"""x0, y0, x1 and y1 in metres."""
+"""x0, y0, x1 and y1, m."""
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -40,7 +40,7 @@ def _area(text: str) -> Area:
 
 
 class UndistortArguments(QuietArguments):
-    """Photographs, and what is made of each."""
+    """Photographs, and which pictures are made of them."""
 
     calibration: Path = arguments.calibration_argument()
     images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, or folders of them")
@@ -121,7 +121,7 @@ def _run(args: UndistortArguments) -> Document:
 
 
 def require_fitting(args: UndistortArguments) -> None:
-    """Raise InputError where options of different pictures are mixed."""
+    """Raise InputError where options for different kinds of pictures are mixed."""
     if args.top_view and args.overlay:
         raise InputError("--top-view and --overlay are two kinds of pictures: make one at a time")
     straight = [name for name, about in given(args).items() if about.get("group") == _STRAIGHT]
@@ -130,7 +130,7 @@ def require_fitting(args: UndistortArguments) -> None:
 
 
 def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[Path, Path]:
-    """Where the picture of each image goes; InputError where two would have one name, or an input would be lost."""
+    """Return the path of each image's picture; InputError where two would have one name, or would replace an input."""
     require_folder(folder)
     outputs: dict[Path, Path] = {}
     taken: dict[Path, Path] = {}
@@ -145,12 +145,12 @@ def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[
 
 
 def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, str | None, scene.Camera]:
-    """Names of the camera and of its station, where that is one, and the camera, posed in that case."""
+    """Return the names of the camera and its station (None if ambiguous), and the camera, posed if it has a station."""
     owners = {name: station.camera for name, station in calibration.estimate.stations.items()}
     wanted = set(calibration.cameras) if args.camera is None else {args.camera}
     if args.station is None and len(wanted) == 1 and list(owners.values()).count(*wanted) > 1:
         (name,) = wanted
-        return name, None, calibration.cameras[name]  # several stations: straight all the same
+        return name, None, calibration.cameras[name]  # several stations: straight images need no pose
     station = station_of(args.calibration, args.station, calibration, args.camera)
     return owners[station], station, calibration.stations[station]
 
@@ -159,7 +159,7 @@ def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, st
 
 
 _PictureMaker = tuple[Callable[[Path], tuple["Image", dict[str, Any], str]], Mapping[str, Any], str]
-"""How each picture is made: from a path to picture, facts and a line about it; facts on all, and what they are."""
+"""Function from a path to a picture, facts and a line about it; facts on all pictures; and a description of these."""
 
 
 def _read(path: Path, camera: scene.Camera, name: str) -> Image:
@@ -245,7 +245,7 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
 
 
 def _field(calibration: Calibration) -> Area:
-    margin_m = 0.3  # around the field in a top view
+    margin_m = 0.3  # margin around the field in a top view
 
     try:
         x, y = posterior.field_grid(calibration.targets)

@@ -1,4 +1,4 @@
-"""The page served to one's own browser: 127.0.0.1 alone, behind a random token, over plain HTTP and a WebSocket."""
+"""Server of the page for the user's own browser: on 127.0.0.1 only, behind a random token, by HTTP and WebSocket."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from ceres_cal.detect.images import read_colour
 from ceres_cal.report.pictures.frames import jpeg_of_at_most
 
 HOST = "127.0.0.1"
-_MOST_BYTES = 1 << 18  # of a message: a state with all that a hand may show
+_MOST_BYTES = 1 << 18  # largest message: a state with the largest number of clicks
 _MOST_WINDOWS = 8
 _QUIET_S = 0.5
-_PATIENCE_S = 5.0  # with a window that takes nothing any more
+_PATIENCE_S = 5.0  # time to wait for a window that no longer receives
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
@@ -44,18 +44,18 @@ _AT_LENGTH: Mapping[str, tuple[str, Callable[[Session, ButtonPress], None]]] = {
     "check": ("the photograph is being compared", lambda session, asked: session.check(asked.photograph)),
     "done": ("the files are being written", lambda session, _: session.done()),
 }
-"""What takes seconds, with what is said meanwhile."""
+"""Actions that take seconds, with the message shown meanwhile."""
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 @lru_cache(maxsize=4)
 def picture_of(path: Path) -> bytes:
-    """A photograph of any kind of file as a JPEG, its pixels where they are stored; InputError for what is none."""
+    """Return a photograph of any file type as a JPEG, with pixels as stored; InputError if it is none."""
     return jpeg_of_at_most(read_colour(path), _WIDEST_PX, _MOST_JPEG)
 
 
 class Server:
-    """Windows that show one session. All that solves is done in one thread, photographs are read in another."""
+    """Windows that show one session. All solves run in one thread, photographs are read in another."""
 
     def __init__(self, session: Session, token: str) -> None:
         self.session: Session = session
@@ -70,7 +70,7 @@ class Server:
         self.port: int = 0
 
     def application(self) -> web.Application:
-        """Its routes: the page and its scripts, photographs by their number, and the socket."""
+        """Return the application with its routes: the page and its scripts, photographs by number, and the socket."""
         app = web.Application(middlewares=[self._guard], client_max_size=1024)
         app.router.add_get("/{token}/", self._page)
         app.router.add_get("/{token}/socket", self._socket)
@@ -80,7 +80,7 @@ class Server:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
-        """Whoever does not come from this machine's own page is refused, and told nothing."""
+        """Refuse requests that do not come from this machine's own page, without further information."""
         own = {f"{HOST}:{self.port}", f"localhost:{self.port}"}
         token = request.match_info.get("token", "")
         origin = request.headers.get("Origin")
@@ -130,7 +130,7 @@ class Server:
         return window
 
     async def _answer(self, window: web.WebSocketResponse, content: str | bytes) -> None:
-        """What a message asks for; a refusal is a sentence to the window that sent it."""
+        """Do what a message asks for; a refusal is one sentence, sent to the same window."""
         message, why = answer_or_reason(lambda: self._message(content))
         if message == ButtonPress("end"):
             self.ended.set()
@@ -154,7 +154,7 @@ class Server:
         return message
 
     def _change(self, message: Message) -> dict[str, Any] | None:
-        """What takes no time; of a drag that goes on the model alone is shown, to who drags."""
+        """Apply a change that takes no time; during a drag only the model is returned, for the window that drags."""
         session = self.session
         match message:
             case Drag():
@@ -176,7 +176,7 @@ class Server:
         return await asyncio.get_running_loop().run_in_executor(self._drags, answer_or_reason, locked)
 
     def _weigh(self) -> None:
-        """What clicks alone tell is said when the hand rests."""
+        """Estimate in the background what the clicks alone determine, once the user pauses."""
 
         async def wait() -> None:
             loop = asyncio.get_running_loop()
@@ -188,7 +188,7 @@ class Server:
             self._thinking = asyncio.create_task(wait())
 
     async def _at_length(self, asked: ButtonPress) -> None:
-        """Work in the other thread; meanwhile every window says what it is."""
+        """Work in the other thread; meanwhile every window shows what is being done."""
         self._busy, work = _AT_LENGTH[asked.what]
 
         async def wait() -> None:
@@ -209,7 +209,7 @@ class Server:
             return {**self.session.everything(), "busy": self._busy}
 
     async def _show(self) -> None:
-        """Every window shows the same."""
+        """Send the same state to every window."""
         everything, why = await self._quickly(self._everything)
         data = everything or {"is": "refused", "why": why}
         await asyncio.gather(*(self._send(window, data) for window in list(self._windows)))
@@ -225,7 +225,7 @@ class Server:
             self._windows.discard(window)
 
     async def close(self) -> None:
-        """Say good-bye to every window."""
+        """Close every window."""
         for window in list(self._windows):
             await self._patiently(window, window.close(code=WSCloseCode.GOING_AWAY, message=b"ended"))
         for threads in (self._work, self._pictures):
@@ -233,10 +233,10 @@ class Server:
 
 
 async def serve(session: Session, port: int, opened: Callable[[str], None]) -> None:
-    """Serve the page until somebody ends it, or it is cancelled.
+    """Serve the page until the user ends it, or it is cancelled.
 
     Args:
-        port: 0: one that is free. opened: called with the address once it answers.
+        port: 0 for any free one. opened: called with the address once the server answers.
 
     Raises:
         InputError: the port is taken.

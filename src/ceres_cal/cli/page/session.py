@@ -1,4 +1,4 @@
-"""One sitting: the state and its history, what was found of it, and what the page is shown of both."""
+"""One session: the state and its history, the results for it, and what the page shows of both."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _BY_HAND = Options(
 
 
 class _Moment(Frozen, eq=True):
-    """A state and what was found of it, by which commands; `auto`: without a start. `base`: what was found before."""
+    """A state with its results and their commands. `auto`: found without a start. `base`: camera found before."""
 
     state: State
     base: scene.Camera | None = None
@@ -49,7 +49,7 @@ class _Moment(Frozen, eq=True):
 
 
 class Session:
-    """What the page works on. One thread at a time changes it: `lock` is held meanwhile."""
+    """State and results that the page works on. One thread at a time changes it and holds `lock` meanwhile."""
 
     def __init__(self, sitting: PageContext, state: State) -> None:
         self.sitting: PageContext = sitting
@@ -77,7 +77,7 @@ class Session:
         return self._now.state
 
     def target(self, state: State) -> scene.Target | None:
-        """The field that is looked for, with the dimensions that were changed."""
+        """Return the field that is searched, with the changed dimensions."""
         if not state.target:
             if self._start is None:
                 return None
@@ -93,7 +93,7 @@ class Session:
         return self._targets[text]
 
     def _base(self, target: scene.Target) -> scene.Camera:
-        """The camera of which the clicks say what is otherwise."""
+        """Return the camera that the clicks correct."""
         if self._now.base is not None:
             return self._now.base
         if self._start is not None:
@@ -103,14 +103,14 @@ class Session:
     # ---- changes ----
 
     def change(self, change: Change) -> None:
-        """Replace the state; InputError where another window was faster, or it names what is not there."""
+        """Replace the state; InputError if another window changed it before, or it names what does not exist."""
         if change.revision != self.revision:
             raise InputError("another window changed it meanwhile: look at what is there now, and do it again")
         written = msgspec.structs.replace(change.state, exports=self.state.exports)
-        self._become(change.state, keep=written == self.state)  # what was found is not of the files to be written
+        self._become(change.state, keep=written == self.state)  # results do not depend on the files to be written
 
     def drag(self, drag: Drag) -> None:
-        """A point or place follows the pointer; what was found before belongs to other clicks."""
+        """Move a point or place with the pointer; earlier results are dropped, since they belong to other clicks."""
         target = self._required_target()
         state = drag.of(self.state, target)
         base = self._base(target)
@@ -141,7 +141,7 @@ class Session:
         self._now = moment
 
     def _settle(self) -> None:
-        """The camera of the state as it is now, and what contradicts it; the state is kept in the folder."""
+        """Fit the camera of the present state, and find clicks that contradict it; save the state in the folder."""
         self.revision += 1
         self.message, self._against = "", {}
         target = self.target(self.state)
@@ -155,7 +155,7 @@ class Session:
         self._keep()
 
     def _keep(self) -> None:
-        """Where that fails all is still in the window, which says so."""
+        """Save the state; if that fails, the window, which still has everything, says so."""
         folder, state = self.sitting.folder, self.state
         _, unkept = answer_or_reason(lambda: save_state(make_folder(folder) / KEPT, state))
         self.message = self.message or unkept
@@ -169,7 +169,7 @@ class Session:
     # ---- work that takes seconds ----
 
     def find(self, *, auto: bool) -> None:
-        """Measure the paint from where the model is, or find the field by itself, and calibrate."""
+        """Measure the paint from where the model is, or find the field without a start, and calibrate."""
         moment = self._now
         target = self.target(moment.state)
         with tempfile.TemporaryDirectory(prefix="ceres-cal-") as folder:
@@ -185,7 +185,7 @@ class Session:
             self._settle()
 
     def done(self) -> None:
-        """Write what the commands write, by the commands, and say how they are typed."""
+        """Write the results by the commands, and list these as they would be typed."""
         moment = self._now
         if moment.made is None:
             raise InputError("find the lines first: there is no calibration to be written yet")
@@ -196,8 +196,8 @@ class Session:
             self.revision += 1
 
     def weigh(self) -> bool:
-        """What takes a second and nobody waits for: advice where the lines were found; before that, what clicks tell
-        alone, under a lens of one coefficient. Whether there is anything new to be shown.
+        """Do background work that takes a second: advice if the lines were found; before that, what the clicks alone
+        determine with a lens of one coefficient. Return whether there is anything new to show.
         """
         moment, revision, target = self._now, self.revision, self.target(self.state)
         if moment.found is not None:
@@ -216,8 +216,8 @@ class Session:
         return current
 
     def check(self, photograph: int) -> None:
-        """Whether the camera of an old calibration still stands where it stood, and by how many pixels it is off where,
-        by one photograph; and how far another calibration is from it.
+        """Check by one photograph whether the camera of an old calibration has moved, and by how many pixels it is off
+        where; and how far another calibration differs from it.
         """
         path, old = self.sitting.photographs[photograph], self._start
         if old is None:
@@ -246,7 +246,7 @@ class Session:
     # ---- what is shown ----
 
     def model(self, drag: Drag | None = None) -> dict[str, Any]:
-        """The model as it is drawn: lines and points px, and where it has what was clicked."""
+        """Return the model as it is drawn: lines and points px, and where it places what was clicked."""
         target = self.target(self.state)
         if target is None or self._camera is None:
             return {"lines": {}, "points": {}, "feet": []}
@@ -264,7 +264,7 @@ class Session:
         }
 
     def everything(self) -> dict[str, Any]:
-        """All that a window needs to show this session."""
+        """Return all that a window needs to show this session."""
         target, found = self.target(self.state), self._now.found
         boards = () if self._now.made is None else self._now.made.boards
         words = "" if target is None else target_words(self.state, target)
@@ -297,7 +297,7 @@ class Session:
         }
 
     def _looked(self) -> dict[str, Any]:
-        """The calibrations that were named, the second drawn as it is."""
+        """Return the named calibrations, the second one with its lines."""
         named = {"start": self.sitting.start, "other": self.sitting.other}
         alike = self.sitting.other is not None and self.sitting.other.name == getattr(self.sitting.start, "name", "")
         drawn: dict[str, Any] = {
@@ -312,7 +312,7 @@ class Session:
         return report.model_of(calibration, report.frame_by_name(calibration, station, frame_of(photograph)))
 
     def _placed(self) -> dict[str, Any]:
-        """The boards that were found, by frame, as the calibration has them."""
+        """Return the boards that were found, by frame, as the calibration places them."""
         found = self._now.found
         if found is None:
             return {}
@@ -323,7 +323,7 @@ class Session:
 
 
 class PageResult(Struct, frozen=True, eq=False):
-    """What came of "find the lines"; `known`: what is said of it."""
+    """Result of "find the lines"; `known`: its description for the page."""
 
     calibration: Calibration
     observations: Observations
@@ -331,7 +331,7 @@ class PageResult(Struct, frozen=True, eq=False):
 
 
 def _lines(model: report.Model) -> list[Any]:
-    """(S, 2) px each."""
+    """(S, 2) px of each line."""
     return [np.round(line[0][::4], 1).tolist() for line in model.lines]
 
 
@@ -351,7 +351,7 @@ def _require_names(state: State, target: scene.Target) -> None:
 
 
 def _about(target: scene.Target, words: str) -> dict[str, Any]:
-    """What a window says of a target."""
+    """Return what a window shows of a target."""
     return {
         "words": words,
         "points": list(target.point_names),
@@ -361,7 +361,7 @@ def _about(target: scene.Target, words: str) -> dict[str, Any]:
 
 
 def opened(sitting: PageContext, first: State) -> Session:
-    """The session of a folder: what was kept there goes on, unless the command line says another field."""
+    """Return the session of a folder: an earlier one is continued, unless the command line names another field."""
     kept = sitting.folder / KEPT
     state = load_state(kept) if kept.exists() else first
     if first.target and first.target != state.target:

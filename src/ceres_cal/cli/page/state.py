@@ -1,4 +1,4 @@
-"""What somebody showed and chose on the page, as frozen data: it is kept, undone, sent and read back whole."""
+"""State of the page: what the user showed and chose, as frozen data that are saved, undone, sent and loaded whole."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ceres_cal.scene.targets import Target
 
 FORMAT, VERSION = "ceres-cal/page", 1
 _MOST_PX = 1e6
-_MOST = 500  # of anything that somebody shows by hand
+_MOST = 500  # largest number of items of each kind that a user may show
 FEW: Meta = Meta(max_length=_MOST)
 
 Name = Annotated[str, Meta(max_length=200)]
@@ -25,7 +25,7 @@ Length = Annotated[float, Meta(gt=0.0, le=10_000.0)]
 
 
 class Click(Struct, frozen=True, forbid_unknown_fields=True):
-    """A pixel that somebody showed, and how well a hand hits it, px."""
+    """A pixel that the user showed, and its standard deviation, px."""
 
     x: Pixel
     y: Pixel
@@ -33,7 +33,7 @@ class Click(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Place(Struct, frozen=True, forbid_unknown_fields=True):
-    """A pixel that lies somewhere on a named curve."""
+    """A pixel that lies somewhere on a named curve, and its standard deviation, px."""
 
     curve: Name
     x: Pixel
@@ -42,22 +42,22 @@ class Place(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Region(Struct, frozen=True, forbid_unknown_fields=True):
-    """A rectangle x0, y0, x1, y1 px of one photograph, by its name, that shows nothing of the field."""
+    """A rectangle x0, y0, x1, y1 px of one photograph, given by name, that shows nothing of the field."""
 
     photograph: Name
     box: tuple[Pixel, Pixel, Pixel, Pixel]
 
 
 class State(Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that one can undo.
+    """Everything that can be undone.
 
     Attributes:
-        target: the field, as `--target` takes it; "" where there is none.
-        points: named corners and crossings. places: of lines and arcs.
-        not_painted: names of curves that this field does not have. regions: what is left out of photographs.
-        facing: as `--facing` takes it. lengths: dimensions that are not the target's own, m. solved: those that the
-            photographs are to tell.
-        board: as `run --board` takes it. priors, exports: as `--prior` and `--to` take them.
+        target: the field, as for `--target`; "" where there is none.
+        points: named corners and crossings. places: places on lines and arcs.
+        not_painted: names of curves that this field does not have. regions: parts of photographs that are left out.
+        facing: as for `--facing`. lengths: dimensions that differ from the target's own, m.
+        solved: dimensions that are estimated from the photographs.
+        board: as for `run --board`. priors, exports: as for `--prior` and `--to`.
     """
 
     target: Text = ""
@@ -77,9 +77,9 @@ class PageContext(Struct, frozen=True):
     """What does not change while the page is open.
 
     Attributes:
-        photographs: those that were named, and their sizes. folder: where results go.
-        target: the field that was named; no other file is read for one.
-        start, other: calibrations that were named: the field is looked for from the first.
+        photographs: named photographs. sizes: their (width, height) px. folder: for results.
+        target: the named field; no other file is read for one.
+        start, other: named calibrations; the search for the field starts from the first.
     """
 
     photographs: tuple[Path, ...]
@@ -91,10 +91,11 @@ class PageContext(Struct, frozen=True):
 
 
 class CommandResults(Struct, frozen=True):
-    """What the commands made of a state.
+    """Results of the commands for a state.
 
     Attributes:
-        typed: the commands. observed: files of observations by their names. boards: the photographs that show one.
+        typed: the commands. observed: files of observations by name. calibration: its file.
+        boards: the photographs that show a board.
     """
 
     typed: tuple[str, ...]
@@ -104,17 +105,17 @@ class CommandResults(Struct, frozen=True):
 
 
 class Change(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="change"):
-    """The state as it is to be; `revision`: of the one that it was made from."""
+    """A new state; `revision` is that of the state it was made from."""
 
     state: State
     revision: int
 
 
 class Drag(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="drag"):
-    """A point or a place of a curve is where the pointer is.
+    """A point, or a place of a curve, is at the pointer.
 
     Attributes:
-        number: which place of the state it is; None: a new one. last: whether it was let go there.
+        number: index of the place in the state; None for a new one. last: whether it was released there.
     """
 
     what: str
@@ -126,7 +127,7 @@ class Drag(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag=
     last: bool = False
 
     def of(self, state: State, target: Target) -> State:
-        """The state with it; InputError where the target has nothing of that name."""
+        """Return the state with the drag applied; InputError where the target has nothing of that name."""
         known = target.point_index if self.what == "point" else target.curve_index
         if self.what not in ("point", "place") or self.name not in known:
             raise InputError(f"{self.what} {self.name!r} is not one of the target's: see `ceres-cal targets`")
@@ -142,7 +143,7 @@ class Drag(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag=
 
 
 class ButtonPress(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="now"):
-    """A button: what is to be done with the state as it is."""
+    """A button: what to do with the present state."""
 
     what: str
     photograph: Annotated[int, Meta(ge=0, le=10_000)] = 0
@@ -153,7 +154,7 @@ _MESSAGES = msgspec.json.Decoder(Message)
 
 
 def read_message(content: str | bytes) -> Message:
-    """A message of the page's; InputError for anything else."""
+    """Decode a message of the page; InputError for anything else."""
     try:
         message: Message = _MESSAGES.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -162,7 +163,7 @@ def read_message(content: str | bytes) -> Message:
 
 
 def target_words(state: State, target: Target) -> str:
-    """The target as `--target` takes it, with the dimensions that were changed."""
+    """Return the target as for `--target`, with the changed dimensions."""
     if not state.lengths:
         return state.target
     return " ".join(json_text({**target.spec, **state.lengths}).split())
@@ -172,7 +173,7 @@ def target_words(state: State, target: Target) -> str:
 
 
 def load_state(path: Path) -> State:
-    """What was kept of an earlier sitting.
+    """Load the state of an earlier session.
 
     Raises:
         InputError: one line that names the file.
@@ -181,6 +182,6 @@ def load_state(path: Path) -> State:
 
 
 def save_state(path: Path, state: State) -> None:
-    """Keep it; InputError where the file cannot be written."""
+    """Save the state; InputError where the file cannot be written."""
     data: dict[str, Any] = msgspec.to_builtins(state)
     write_json(path, {"format": FORMAT, "version": VERSION, **data})
