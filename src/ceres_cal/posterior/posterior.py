@@ -164,6 +164,21 @@ class Posterior(Frozen):
         stated = self.stated.over(self.keys).marginal(information.keys)
         return how(information.less(stated)) + stated
 
+    def again(self, added: Information) -> Information:
+        """What more observations of the same kind add to the information: they average out what varies from one to the
+        next, which is what the model alone says, and not what widens it.
+
+        Args:
+            added: about all of the numbers, were it all that there is to know.
+        """
+        if self.by_model is None:
+            return added
+        stated = self.stated.over(self.keys)
+        seen, model = self.information.less(stated), self.by_model.less(stated)
+        factor, excess = model.beyond(seen.spread.covariance)
+        more = Information(self.keys, model.matrix / factor + added.over(self.keys).matrix)
+        return Information(self.keys, more.widened(excess).matrix - seen.matrix)
+
     @cached_property
     def stated_sd(self) -> Array:
         """(P,) standard deviations by the statements alone, infinite where nothing was stated."""

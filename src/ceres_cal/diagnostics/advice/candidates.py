@@ -47,6 +47,11 @@ class Measurement(Frozen):
     placements: Mapping[str, Pose] = field(default_factory=dict)
     views: tuple[ViewPlan, ...] = ()
 
+    @property
+    def is_seen_again(self) -> bool:
+        """Whether it observes nothing but what the calibration did, from the same place."""
+        return bool(self.views) and not self.targets
+
     def before(self, cam_from_world: Pose, other: Pose) -> Measurement:
         """The same with every placement as far before a camera at another pose as it is before one at this."""
         moved = other.inverse @ cam_from_world
@@ -123,6 +128,12 @@ class Ground(Frozen):
         )
 
 
+def news(measurement: Measurement, ground: Ground, outlook: Outlook) -> Information:
+    """What a measurement would add to what is known: of what was observed already, that noise is averaged out."""
+    told = ground.information_of(measurement)
+    return outlook.posterior.again(told) if measurement.is_seen_again else told
+
+
 def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:
     """What the views would show where everything is as estimated, without noise, in units of sigma 1."""
     if not views:
@@ -173,7 +184,7 @@ class CandidateSearch(Frozen):
     ) -> Iterator[Measurement]:
         """Of a pool the best ones, each the one that brings most beside those before it."""
         left = list(pool)
-        informations = [self.ground.information_of(measurement) for measurement in left]
+        informations = [news(measurement, self.ground, self.outlook) for measurement in left]
         taken: list[Measurement] = []
         total = Information.nothing(self.ground.keys)
         while left and len(taken) < max(counts):

@@ -12,7 +12,7 @@ from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_
 from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.base.words import short
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement
+from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, news
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Information, Weighting
@@ -108,7 +108,7 @@ def advise(
     ground, outlook = _prepared(calibration, station, height_m)
     search = CandidateSearch(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
     candidates = list(search.candidates())
-    informations = list(each(ground.information_of, candidates, executor=executor))
+    informations = list(each(partial(news, ground=ground, outlook=outlook), candidates, executor=executor))
     promises = []
     one_promise = partial(_promise, ground=ground, outlook=outlook)
     for number, promise in enumerate(each(one_promise, candidates, informations, executor=executor), start=1):
@@ -144,7 +144,7 @@ def promised(
         InputError: see `advise`.
     """
     ground, outlook = _prepared(calibration, station, height_m)
-    return tuple(_promise(one, ground.information_of(one), ground, outlook) for one in measurements)
+    return tuple(_promise(one, news(one, ground, outlook), ground, outlook) for one in measurements)
 
 
 def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
@@ -168,7 +168,9 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
     keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
     stated = posterior.stated.over(posterior.keys).marginal(keys)
     mixtures = {name: posterior.mixtures[name] for name in posterior.followed}
-    return replace(posterior, information=posterior.information.marginal(keys), mixtures=mixtures, stated=stated)
+    known, model = posterior.information.marginal(keys), posterior.by_model
+    by_model = None if model is None else model.marginal(keys)
+    return replace(posterior, information=known, mixtures=mixtures, by_model=by_model, stated=stated)
 
 
 def _weighting(fit: Fit, camera: str) -> Weighting:
@@ -210,7 +212,7 @@ def _promise(measurement: Measurement, added: Information, ground: Ground, outlo
 def _information_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Information:
     """What it would say if everything were elsewhere: boards are held before the camera, wherever that is."""
     here, other = (e.stations[outlook.today.station].cam_from_world for e in (ground.estimate, there))
-    return replace(ground, estimate=there).information_of(measurement.before(here, other))
+    return news(measurement.before(here, other), replace(ground, estimate=there), outlook)
 
 
 def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
@@ -232,8 +234,12 @@ def _next(
     enough_mm: float,
 ) -> Promise | None:
     """What brings most after the first, of another kind; None where nothing does, or the first is good enough."""
-    kind = candidates[first].kind
-    others = [number for number, candidate in enumerate(candidates) if candidate.kind != kind]
+    kind, again = candidates[first].kind, candidates[first].is_seen_again
+    others = [
+        number
+        for number, candidate in enumerate(candidates)
+        if candidate.kind != kind and not (again and candidate.is_seen_again)
+    ]
     after = outlook.after_each(informations[first], [informations[number] for number in others])
     promises = [Promise(candidates[number], one) for number, one in zip(others, after, strict=True)]
     chosen = _chosen(promises, outlook.after(informations[first]), enough_mm) if promises else None
