@@ -1,4 +1,4 @@
-// What Python hands over, checked, as the kernels take it: see `kernels/__init__.py`.
+// Checked arguments from Python in the form that the kernels take: see `kernels/__init__.py`.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -22,7 +22,7 @@ constexpr nb::ssize_t N = -1;  // an axis of any length
 template <class Number, nb::ssize_t... axes>
 using Array = nb::ndarray<Number, nb::shape<axes...>, nb::c_contig, nb::device::cpu>;
 
-// Read: a copy, where it is laid out otherwise or is of other numbers. Filled: as it is, or it is refused.
+// Read: copied if it has another layout or type of numbers. Filled: used as it is, or refused.
 template <nb::ssize_t... axes>
 using Read = Array<const double, axes...>;
 template <nb::ssize_t... axes>
@@ -37,7 +37,7 @@ struct type_caster<ceres_cal::Filled<axes...>> {
     using Whole = make_caster<ceres_cal::Array<double, axes...>>;
     NB_TYPE_CASTER(ceres_cal::Filled<axes...>, Whole::Name)
     bool from_python(handle given, uint32_t flags, cleanup_list* cleanup) noexcept {
-        Whole found;  // never a copy, which would be filled in its place
+        Whole found;  // never a copy, which would be filled instead of the caller's array
         if (!found.from_python(given, flags & ~static_cast<uint32_t>(cast_flags::convert), cleanup)) return false;
         value = {std::move(found.value)};
         return true;
@@ -71,7 +71,7 @@ auto* row(const Of& array, int64_t number) {
     return array.data() + number * array.stride(0);
 }
 
-// The optics of a camera: the lenses that are compiled, or one that Python has alone.
+// The optics of a camera, with a compiled lens, or with one that exists only in Python.
 struct OpticsGiven {
     nb::object lens;
     std::string kind;
@@ -101,7 +101,7 @@ struct OpticsGiven {
     }
 };
 
-// Groups of rows, each from bounds[g] to bounds[g + 1].
+// Checks the bounds of groups of rows, each from bounds[g] to bounds[g + 1].
 inline void check_bounds(const Array<const int64_t, N>& bounds, int64_t first, int64_t last, size_t rows) {
     require(first >= 0 && last < static_cast<int64_t>(bounds.size()), "there are fewer sights than that");
     for (int64_t v = first; v < last; ++v) require(bounds.data()[v] <= bounds.data()[v + 1], "bounds: must not fall");
@@ -109,7 +109,7 @@ inline void check_bounds(const Array<const int64_t, N>& bounds, int64_t first, i
             "bounds: there are fewer observations than that");
 }
 
-// The sights from `first` to `last` of some columns, and what these need to live.
+// The columns of the sights from `first` to `last`, and the arrays that own their data.
 template <int moved>
 struct Columns {
     Array<const int64_t, N> bounds;
@@ -172,7 +172,7 @@ struct CurvesGiven : Columns<ON_TRACK> {
         for (int64_t k = first < last ? view.bounds[first] : 0; first < last && k < view.bounds[last]; ++k)
             require(view.track[k] >= 0 && view.track[k] < many, "curves: there are fewer tracks than that");
     }
-    void require_directions() const {}  // a track has its own
+    void require_directions() const {}  // a track has its own direction
 };
 
 inline Loss loss_given(Tuple given) {
@@ -181,7 +181,7 @@ inline Loss loss_given(Tuple given) {
     return {static_cast<LossCode>(code), nb::cast<double>(given[1])};
 }
 
-// What the solve's kernels take of sights from `first` to `last`.
+// The arguments of the solve's kernels for the sights from `first` to `last`.
 struct Seen {
     OpticsGiven optics;
     Array<const int64_t, N> free;

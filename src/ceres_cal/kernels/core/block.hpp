@@ -1,7 +1,8 @@
-// The compressed block of one sight, as Ceres asks for it (design, section 6).
+// The compressed block of one sight, as Ceres uses it (design, section 6).
 //
-// A = sum w [J e]^T [J e] over [free intrinsics | structure | 6 pose | e] is factored as A = U^T U; the rows of U are
-// the Jacobian that Ceres sees, their last column its residual. Station and placement follow by the chain rule on U.
+// A = sum w [J e]^T [J e] over [free intrinsics | structure | 6 pose | e] is factored as A = U^T U. The rows of U are
+// the Jacobian that Ceres sees, and their last column its residual. The Jacobian by station and placement follows from
+// U by the chain rule.
 #pragma once
 
 #include "dense.hpp"
@@ -9,9 +10,9 @@
 
 namespace ceres_cal {
 
-constexpr double ROUNDING = 1e-9;  // of a cost
+constexpr double ROUNDING = 1e-9;  // relative, of a cost
 
-// pose = station @ placement, and the left perturbation of pose that a change of either vector makes.
+// pose = station @ placement, and the left perturbation of the pose by a change of either vector.
 struct Chain {
     double pose[12], to_station[36] = {}, to_placement[36] = {};
 
@@ -34,8 +35,8 @@ struct Chain {
     }
 };
 
-// Columns of U from `first` on, times the chain rule where there is one, as the row-major Jacobian of one block;
-// nothing where the block is held.
+// Copies `count` columns of U from `first` on, times the chain rule if there is one, to the row-major Jacobian of a
+// block; nothing if the block is held.
 inline void copy_columns(int size, const double* upper, int first, int count, const double* chain, double* jacobian) {
     if (jacobian == nullptr) return;
     std::fill_n(jacobian, static_cast<size_t>(size) * count, 0.0);
@@ -43,8 +44,8 @@ inline void copy_columns(int size, const double* upper, int first, int count, co
     for (int row = 0; row < size - 1; ++row) std::copy_n(upper + size * row + first, count, jacobian + count * row);
 }
 
-// What Ceres asks of the block of the first sight; false where an observation cannot be projected. jacobians: of
-// camera, station, placement and structure, null where one is held.
+// Evaluates the block of the first sight for Ceres; returns false if an observation cannot be projected. jacobians: by
+// camera, station, placement and structure, null if held.
 inline bool evaluate_block(Lens& lens, const Unknowns& unknowns, const Observed& seen, const double* station,
                            const double* placement, double* residuals, double* const* jacobians) {
     const int size = unknowns.size(), last = size - 1;
@@ -61,7 +62,7 @@ inline bool evaluate_block(Lens& lens, const Unknowns& unknowns, const Observed&
             residuals[row] = upper[size * row + last];
             missing -= residuals[row] * residuals[row];
         }
-        if (missing > -ROUNDING * cost) break;  // else Newton's step promises more than there is
+        if (missing > -ROUNDING * cost) break;  // otherwise Newton's step promises more than the cost
     }
     residuals[last] = std::sqrt(std::max(missing, 0.0));
     copy_columns(size, upper.data(), 0, unknowns.count, nullptr, jacobians[0]);

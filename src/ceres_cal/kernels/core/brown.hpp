@@ -1,4 +1,4 @@
-// Brown's lens as in OpenCV: see opencv.py. Form: the places of k4 and s1 among the intrinsics, 0 for none.
+// Brown's lens as in OpenCV: see opencv.py. Form: the indices of k4 and s1 in the intrinsics, 0 for none.
 #pragma once
 
 #include <algorithm>
@@ -18,7 +18,7 @@ class Brown final : public Lens {
         k_[1] = intrinsics[4], k_[2] = intrinsics[5], k_[3] = intrinsics[8];
         for (int j = 0; j < 3; ++j) q_[1 + j] = rational_ > 0 ? intrinsics[rational_ + j] : 0.0;
         for (int j = 0; j < 4; ++j) s_[j] = prism_ > 0 ? intrinsics[prism_ + j] : 0.0;
-        // Polynomials u (d_0 + d_1 u + ...) whose slopes are the radial slope times q^2, and q, what is under the line.
+        // Polynomials u (d_0 + d_1 u + ...) whose slopes are the radial slope times q^2, and the denominator q.
         double rising[13] = {}, under[7] = {};
         for (int j = 0; j < 4; ++j) {
             under[2 * j] = q_[j] / (2.0 * j + 1.0);
@@ -64,7 +64,7 @@ class Brown final : public Lens {
         });
         differentiate_decentring(rows, 6, u_, v_);
         for (int k = 0; k < 3 && rational_ > 0; ++k) {
-            double* own = rows.show(rational_ + k);  // k1, k2 and k3 have the same powers over the line
+            double* own = rows.show(rational_ + k);  // k1, k2 and k3 have the same powers in the numerator
             each(n, [&](int i) { own[i] = -radial_[i] * x[k][i], own[n + i] = -radial_[i] * y[k][i]; });
         }
         for (int k = 0; k < 4 && prism_ > 0; ++k) {
@@ -76,7 +76,7 @@ class Brown final : public Lens {
     }
 
   private:
-    static constexpr double FAR = 6.0, FARTHEST = 1e4;  // ideal radii, of 80.5 and 89.994 degrees off the axis
+    static constexpr double FAR = 6.0, FARTHEST = 1e4;  // ideal radii, at 80.5 and 89.994 degrees from the axis
 
     Decentring by_;
     double k_[4] = {1.0}, q_[4] = {1.0}, s_[4] = {}, limit_ = 0.0;

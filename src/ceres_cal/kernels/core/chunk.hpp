@@ -1,4 +1,4 @@
-// A chunk of observations is laid out number by number, so that plain loops over it fill the SIMD registers.
+// A chunk of observations is stored component by component, so that plain loops over it fill the SIMD registers.
 #pragma once
 
 #include <algorithm>
@@ -14,8 +14,8 @@
 
 namespace ceres_cal {
 
-constexpr int CHUNK = 128;  // observations at most: what is worked on stays in the first cache
-constexpr int LANES = 4;    // a chunk is filled up to a multiple of it, by its last observation without a weight
+constexpr int CHUNK = 128;  // most observations in a chunk: its data stay in the first-level cache
+constexpr int LANES = 4;    // a chunk is padded to a multiple of this with copies of its last observation, of weight 0
 
 struct alignas(64) Lane {
     double value[CHUNK];
@@ -23,7 +23,7 @@ struct alignas(64) Lane {
     double operator[](int i) const { return value[i]; }
 };
 
-// body(i) for i from 0 to n, a multiple of LANES; no i has to do with another one.
+// Calls body(i) for i from 0 to n, a multiple of LANES; the iterations must be independent.
 template <class Body>
 inline void each(int n, Body body) {
     const int end = n & ~(LANES - 1);
@@ -31,9 +31,9 @@ inline void each(int n, Body body) {
     for (int i = 0; i < end; ++i) body(i);
 }
 
-// products = P P^T over the first n places of so many rows, lower triangle, each of its rows so many numbers and three
-// long. Four rows by three, to read each one less; of more sums at once than the processor has registers for each takes
-// longer.
+// products = P P^T over the first n columns of `count` rows, lower triangle; each row of products has count + 3
+// numbers. Blocks of four rows by three reduce the reads; with larger blocks the sums would no longer fit into the
+// processor's registers.
 inline void find_products(double* const* own, int count, int n, double* products) {
     const int last = count - 1, stride = count + 3, end = n & ~(LANES - 1);
     for (int k = 0; k < count; k += 4) {
@@ -65,16 +65,16 @@ struct Image {
     Lane x, y, xx, xy, yx, yy, xz, yz;
 };
 
-// Derivatives of the chunk's pixels, a row for each number: x components, then y components.
+// Derivatives of the chunk's pixels, one row for each number: x components, then y components.
 struct Rows {
     double* base;
-    bool* shown;  // of each intrinsic whether the chunk shows anything of it; rows of others are not filled
+    bool* shown;  // for each intrinsic, whether the chunk depends on it; rows of other intrinsics are not filled
     int n;
     double* x(int row) const { return base + 2 * static_cast<int64_t>(n) * row; }
     double* y(int row) const { return x(row) + n; }
-    // A row to be filled.
+    // A row that the caller fills.
     double* show(int row) const { return shown[row] = true, x(row); }
-    // A row to be added to, 0 at first.
+    // A row to which the caller adds; it is set to 0 at first.
     void open(int row) const {
         if (shown[row]) return;
         double* own = show(row);

@@ -8,11 +8,11 @@
 
 namespace ceres_cal {
 
-constexpr int MANY = 64;        // numbers from which on rounding in what observations leave open adds up
-constexpr double LIFT = 1e-12;  // and the share of the diagonal that is added against it: that changes no slope
+constexpr int MANY = 64;        // numbers above which rounding adds up in what observations leave undetermined
+constexpr double LIFT = 1e-12;  // share of the diagonal that is then added against it; it changes no slope
 
-// U with U^T U = A from A's lower triangle; where less than a share `least` of the diagonal is left the row of U is
-// zero. Row i of A begins at i * stride.
+// Computes U with U^T U = A from A's lower triangle. Where less than a share `least` of the diagonal is left, the row
+// of U is zero. Row i of A begins at i * stride.
 inline void cholesky(int size, const double* normal, int stride, double* upper, double least = 1e-15) {
     const double whole = 1.0 + (size > MANY ? LIFT : 0.0);
     std::fill_n(upper, static_cast<size_t>(size) * size, 0.0);
@@ -36,7 +36,7 @@ inline void cholesky(int size, const double* normal, int stride, double* upper, 
     }
 }
 
-// x <- (U^T U)^-1 x by forward and back substitution, of (size, columns); where a row of U is zero x is.
+// x <- (U^T U)^-1 x for x (size, columns), by forward and back substitution; where a row of U is zero, so is that of x.
 inline void substitute(int size, const double* upper, double* x, int columns = 1) {
     const auto finish = [&](int k, int first, int last, int apart, const double* factors) {
         double *own = x + columns * k, diagonal = upper[size * k + k], scale = diagonal > 0.0 ? 1.0 / diagonal : 0.0;
@@ -51,10 +51,10 @@ inline void substitute(int size, const double* upper, double* x, int columns = 1
     for (int k = size - 1; k >= 0; --k) finish(k, k + 1, size, 1, upper + size * k);
 }
 
-// A symmetric matrix (size, size) turned into its eigenvalues, on its diagonal; eigenvectors are the columns of
+// Replaces a symmetric matrix (size, size) by its eigenvalues on the diagonal; the eigenvectors are the columns of
 // `vectors`.
 inline void eigen(int size, double* matrix, double* vectors) {
-    constexpr int MOST = 50;  // rounds of Jacobi's rotations: some eight are enough
+    constexpr int MOST = 50;  // rounds of Jacobi rotations: about eight are enough
     constexpr double ROUNDING = 1e-32;
     const auto rotate = [&](double* a, int p, int q, int next, double sine, double cosine) {
         for (int k = 0; k < size; ++k) {
@@ -82,7 +82,7 @@ inline void eigen(int size, double* matrix, double* vectors) {
     }
 }
 
-// out (rows, columns) = a (rows, inner) b (inner, columns), their rows so many numbers apart.
+// out (rows, columns) = a (rows, inner) b (inner, columns); `..._apart`: distance of consecutive rows in memory.
 inline void multiply(int rows, int inner, int columns, const double* a, int a_apart, const double* b, int b_apart,
                      double* out, int out_apart) {
     for (int j = 0; j < rows; ++j)
@@ -93,7 +93,8 @@ inline void multiply(int rows, int inner, int columns, const double* a, int a_ap
         }
 }
 
-// Squared angle of a rotation vector, sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3, also where a is tiny.
+// The squared angle of a rotation vector, sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3; accurate also for tiny
+// angles.
 struct SineSeries {
     double angle2, sine, versine, rest;
     explicit SineSeries(const double* w) : angle2(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) {

@@ -1,8 +1,8 @@
-// Many placements that only one station sees each: their poses are eliminated from the problem (variable projection).
+// Elimination of many placements, each seen by one station only, from the problem (variable projection).
 //
-// For given intrinsics each pose is brought to its own best value, and what is left of the normal equations, the Schur
-// complement A_cc - A_cp A_pp^-1 A_pc, speaks of what all sights share: the free intrinsics and the structure. Near the
-// best pose one evaluation per sight is enough: the complement takes the rest of the step, and its cost, along.
+// For given intrinsics each pose is solved for, and the Schur complement A_cc - A_cp A_pp^-1 A_pc of the normal
+// equations is the information on what all sights share: the free intrinsics and the structure. Near the best pose one
+// evaluation per sight is enough: the complement includes the rest of the step, and its cost.
 #pragma once
 
 #include "dense.hpp"
@@ -10,7 +10,7 @@
 
 namespace ceres_cal {
 
-// Placements at their best for given shared numbers: see `Sweep` in `kernels/__init__.py`.
+// Placements solved for at given shared numbers: see `Sweep` in `kernels/__init__.py`.
 struct Sweep {
     double *poses, *gains, *costs, *reduced;
 };
@@ -20,7 +20,7 @@ class Elimination {
     Elimination(Lens& lens, const Unknowns& unknowns, const Observed& seen, bool newton)
         : sums_(lens, unknowns, seen), newton_(newton), count_(unknowns.shared()), size_(unknowns.size()) {}
 
-    // One sight at its best pose: its cost, and what it says of the shared numbers.
+    // Solves for the pose of one sight: sets its cost, and adds its information on the shared numbers.
     void eliminate(int64_t sight, double tolerance, const double* change, const Sweep& sweep) {
         double *kept = sweep.poses + 12 * sight, *gains = sweep.gains + 6 * static_cast<int64_t>(count_) * sight;
         double pose[12] = {}, moved[12], step[6];
@@ -37,7 +37,7 @@ class Elimination {
                 std::copy_n(moved, 12, pose), normal_.swap(trial_);
                 cost = found, damping *= 0.1;
             } else if (!std::isfinite(cost) || promise <= 1e-12 * cost) {
-                break;  // nothing to be seen from where it starts; rounding
+                break;  // nothing can be projected from the start; or only rounding is left
             } else {
                 damping = std::max(1e-3, 10.0 * damping);
             }
@@ -72,8 +72,8 @@ class Elimination {
         for (int j = 0; j < 3; ++j) moved[4 * j + 3] = pose[4 * j + 3] + step[3 + j];
     }
 
-    // gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is. The
-    // answer is what the step, -gain's last column, promises of the cost.
+    // gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; an undetermined direction stays unchanged. Returns by how
+    // much the step, minus gain's last column, should reduce the cost.
     double solve_pose(double damping) {
         double damped[36], upper[36], promise = 0.0;
         for (int k = 0; k < 6; ++k) {
@@ -86,7 +86,7 @@ class Elimination {
         return promise;
     }
 
-    // reduced += A_cc - A_cp A_pp^-1 A_pc, lower triangle, the residual's row last.
+    // reduced += A_cc - A_cp A_pp^-1 A_pc, lower triangle, with the residual's row last.
     void add_complement(double* reduced) {
         const double *p[6], *last = normal(count_ + 6);
         for (int k = 0; k < 6; ++k) p[k] = normal(count_ + k);

@@ -1,4 +1,4 @@
-// Inverses: of a map along a radius that grows, and of a lens by Newton's method. See `scene/lens/planar.py`.
+// Inverses: of a growing map along a radius, and of a lens, by Newton's method. See `scene/lens/planar.py`.
 #pragma once
 
 #include <algorithm>
@@ -9,8 +9,8 @@
 
 namespace ceres_cal {
 
-// Polynomials side by side, each over the next stretch of a width and by its place there from 0 on, the last one
-// without an end; over another polynomial, where there is one.
+// A map of consecutive polynomials, each over an interval of the same width and in terms of the position in it from 0
+// to 1, the last one without an end; divided by another polynomial, if there is one.
 class MonotonicMap {
   public:
     MonotonicMap(int pieces, int terms, const double* above, double width, int terms_below, const double* below,
@@ -24,7 +24,8 @@ class MonotonicMap {
           limit_(limit),
           end_(limit < FAR ? at(limit).value : FAR) {}
 
-    // x up to the limit where the map is `target`, by Newton from a start, and bisection; NaN where none is.
+    // x up to the limit where the map equals `target`, by Newton's method from a start, and bisection; NaN if there is
+    // none.
     double inverse(double target, double start) const {
         constexpr double NONE = std::numeric_limits<double>::quiet_NaN();
         if (!(target >= 0.0 && target < FAR && target <= end_)) return NONE;
@@ -40,7 +41,7 @@ class MonotonicMap {
             if (error < 0.0) low = x;
             if (error > 0.0) high = x;
             double move = -error / there.slope;
-            // A step that does not halve the last one may run in a circle.
+            // Steps that do not halve the last one may run in a circle.
             const bool good = x + move >= low && x + move <= high && std::abs(move) <= 0.5 * last;
             if (!good) move = 0.5 * (low + high) - x;
             if (!(std::abs(error) > 1e-15 * target)) move = 0.0;
@@ -81,17 +82,18 @@ class MonotonicMap {
 
     int pieces_, terms_, terms_below_;
     const double *above_, *below_;
-    double share_, limit_, end_;  // of a width, one; the last: how large the map is at its limit
+    double share_, limit_, end_;  // 1 / width; the limit; the value of the map at its limit
 };
 
-// Rays of a lens on square pixels whose images are some offsets, each sought in the plane that touches its start.
+// Rays of a lens on square pixels from their offsets. Each is searched in the plane that touches the sphere at its
+// start.
 class RaySearch {
   public:
-    // Steps of the n rays (x, y, z), unit vectors at first, towards the offsets (x, y), no longer than so many radians;
-    // NaN where they do not get there.
+    // Moves the n rays (x, y, z), unit vectors at first, to the offsets (x, y), in steps of at most `longest` radians;
+    // NaN for rays without convergence.
     void find(Lens& lens, int n, const double* offsets, double longest, double* rays) {
         constexpr int STEPS = 60;                                           // a safeguard: Newton needs 4 to 8
-        constexpr double EXACT = 1e-12, ROUNDING = 1e-15, AT_REST = 1e-13;  // errors that will do, or are the least
+        constexpr double EXACT = 1e-12, ROUNDING = 1e-15, AT_REST = 1e-13;  // errors that suffice; least error; step
         const int filled = (n + LANES - 1) / LANES * LANES;
         double error[CHUNK];
         bool moving[CHUNK];
@@ -107,7 +109,7 @@ class RaySearch {
                 const double *to = offsets + 2 * i, *ray = rays + 3 * i;
                 const double x = seen_.x[i] - to[0], y = seen_.y[i] - to[1];
                 error[i] = std::max(std::abs(x), std::abs(y)) / (lens.phi + std::max(std::abs(to[0]), std::abs(to[1])));
-                // Two directions across the start (Duff and others, JCGT 6, 2017), and the derivatives along them.
+                // Two directions across the ray (Duff and others, JCGT 6, 2017), and the derivatives along them.
                 const double sign = std::copysign(1.0, ray[2]), a = -1.0 / (sign + ray[2]), b = ray[0] * ray[1] * a;
                 const double e[3] = {1.0 + sign * ray[0] * ray[0] * a, sign * b, -sign * ray[0]};
                 const double f[3] = {b, sign + ray[1] * ray[1] * a, -ray[1]};
@@ -116,7 +118,7 @@ class RaySearch {
                 const double yx = seen_.yx[i] * e[0] + seen_.yy[i] * e[1] + seen_.yz[i] * e[2];
                 const double yy = seen_.yx[i] * f[0] + seen_.yy[i] * f[1] + seen_.yz[i] * f[2];
                 const double area = xx * yy - xy * yx, p = (yy * x - xy * y) / area, q = (xx * y - yx * x) / area;
-                // Where the map ends it hardly grows, and a whole step would end behind others that lead past it.
+                // Where the map ends it hardly grows, and a full step would end in another branch, past the solution.
                 const double length = std::hypot(p, q), part = std::min(1.0, longest / std::max(length, TINY));
                 chunk_.x[i] -= part * (p * e[0] + q * f[0]);
                 chunk_.y[i] -= part * (p * e[1] + q * f[1]);

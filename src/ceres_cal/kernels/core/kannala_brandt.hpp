@@ -1,4 +1,4 @@
-// Kannala and Brandt's lens: see opencv.py. Form: the place of p1 among the intrinsics, 0 for none.
+// Kannala and Brandt's lens: see opencv.py. Form: the index of p1 in the intrinsics, 0 for none.
 #pragma once
 
 #include <cmath>
@@ -35,9 +35,9 @@ class KannalaBrandt final : public Lens {
   private:
     static constexpr double PI = 3.14159265358979323846;
 
-    // Of a length along the meridian and its derivative by the distance across: with x and y it is `stretch` times
-    // them, whose derivatives are stretch + bend x^2, bend x y ... On the axis the stretch is 1 / z, and x^2 takes the
-    // bend to 0.
+    // For a length along the meridian and its derivative by the distance across: its components in x and y are
+    // `stretch` times x and y, with the derivatives stretch + bend x^2, bend x y ... On the axis the stretch is 1 / z,
+    // and x^2 makes the bend irrelevant.
     struct Meridian {
         double stretch, bend;
     };

@@ -1,4 +1,4 @@
-// What a lens does for the solve, as the camera's optics: a chunk of rays at a time.
+// A lens as the solve uses it, with the rest of the camera's optics, for one chunk of rays at a time.
 #pragma once
 
 #include <algorithm>
@@ -8,7 +8,7 @@
 
 namespace ceres_cal {
 
-// A row of numbers whose places are checked: a lens is made from it, chunks are not.
+// An array with checked access. A lens is made from it; chunks are not checked.
 struct Numbers {
     const double* values;
     int count;
@@ -19,14 +19,14 @@ struct Numbers {
     }
 };
 
-// What a lens is made from: `Lens.form` of Python; phi, aspect, cx, cy and the scaled coefficients; skew; and half the
-// image diagonal, px.
+// The data from which a lens is made: `Lens.form` of Python; phi, aspect, cx, cy and the scaled coefficients; skew; and
+// half the image diagonal, px.
 struct Making {
     Numbers form, intrinsics;
     double skew, unit;
 };
 
-// Brown's decentring of a point (a, b): where it moves to, and the derivatives of that, which are symmetric.
+// Brown's decentring of a point (a, b): its displacement, and the derivatives of that, which are symmetric.
 struct Decentring {
     double p1 = 0.0, p2 = 0.0;
     double x(double a, double b) const { return 2.0 * p1 * a * b + p2 * (3.0 * a * a + b * b); }
@@ -36,7 +36,7 @@ struct Decentring {
     double yy(double a, double b) const { return 6.0 * p1 * b + 2.0 * p2 * a; }
 };
 
-// A lens under phi, aspect, principal point and skew.
+// A lens with phi, aspect, principal point and skew.
 class Lens {
   public:
     explicit Lens(const Making& from)
@@ -51,10 +51,10 @@ class Lens {
     Lens& operator=(const Lens&) = delete;
     virtual ~Lens() = default;
 
-    const int count;  // of the intrinsics, the skew last
+    const int count;  // number of the intrinsics, with the skew last
     const double phi, aspect, cx, cy, skew, unit;
 
-    // Of the first n rays; false where any has no answer. A skew of the pixels leans the lens's own image.
+    // Projects the first n rays; returns false if any has no image. A skew of the pixels shears the lens's own image.
     bool project(int n, const Rays& rays, Image& image) {
         const bool good = distort(n, rays, image);
         if (skew != 0.0)
@@ -67,7 +67,7 @@ class Lens {
         return good;
     }
 
-    // Derivatives of the pixels that were projected last by phi, aspect, principal point, coefficients and skew.
+    // Fills derivatives of the last projected pixels by phi, aspect, principal point, coefficients and skew.
     void fill(const Image& image, const Rows& rows) {
         const int n = rows.n, last = count - 1;
         for (int k = 0; k < count; ++k) rows.shown[k] = k < 4 || k == last;
@@ -88,15 +88,15 @@ class Lens {
     }
 
   protected:
-    // Fills the first n places of the image; false where any ray has no answer.
+    // Fills the first n entries of the image; returns false if any ray has no image.
     virtual bool distort(int n, const Rays& rays, Image& image) = 0;
 
-    // Of the rays that were distorted last: rows 4 and on, the derivatives of the pixel's x and y (its y is aspect
-    // times the offset's) by each coefficient as the solver has it; and row 0, phi's, where the offset is not
-    // proportional to phi. Marks the rows that it fills.
+    // Fills, for the rays that were distorted last, rows 4 and up: the derivatives of the pixel's x and y (its y is
+    // aspect times the offset's) by each coefficient in the solver's unit; and row 0, that of phi, if the offset is not
+    // proportional to phi. It marks the rows that it fills.
     virtual void differentiate(const Rows& rows) = 0;
 
-    // The rows of Brown's decentring of the points (a, b), from the place `at` on.
+    // Fills the rows of Brown's decentring of the points (a, b), from row `at` on.
     void differentiate_decentring(const Rows& rows, int at, const Lane& a, const Lane& b) const {
         for (int k = 0; k < 2; ++k) {
             const Decentring one = {k == 0 ? phi : 0.0, k == 1 ? phi : 0.0};
@@ -106,7 +106,7 @@ class Lens {
     }
 };
 
-constexpr double TINY = 1e-150;  // its square is still a number
+constexpr double TINY = 1e-150;  // its square can still be represented
 
 // d/dx of x (d_0 + d_1 x + d_2 x^2 ...).
 inline double radial_slope(const double* dense, int count, double x) {
@@ -115,8 +115,8 @@ inline double radial_slope(const double* dense, int count, double x) {
     return total;
 }
 
-// Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `farthest`, the end of what can be observed. It is looked
-// for in equal steps up to `far`, and in growing ones beyond.
+// The place where x (d_0 + d_1 x + d_2 x^2 ...) stops growing, or `farthest`, the largest observable one. It is
+// searched in equal steps up to `far`, and in growing steps beyond.
 inline double growing_until(const double* dense, int count, double far, double farthest) {
     constexpr int STEPS = 96, HALVINGS = 50;
     constexpr double GROWTH = 1.1;

@@ -1,4 +1,4 @@
-// The module: Python's doors to the kernels. `kernels/__init__.py` says what each does and takes.
+// The Python module: the functions of the kernels. `kernels/__init__.py` describes what each does and takes.
 #if defined(_MSC_VER)
 #define NOMINMAX
 #include <windows.h>
@@ -19,7 +19,7 @@ namespace {
 using Bounds = Array<const int64_t, N>;
 using Poses = Read<N, 3, 4>;
 
-// What is run without Python's lock.
+// Runs work without Python's lock.
 template <class Work>
 auto unlocked(Work work) {
     const nb::gil_scoped_release release;
@@ -69,7 +69,7 @@ void inverse_of_growing(const Read<N, N>& above, double width, const Read<N>& be
     unlocked([&] {
         const MonotonicMap map(whole(pieces), whole(terms), above.data(), width, whole(below.size()), below.data(),
                                limit);
-        double last = 1.0, before = 1.0;  // shares of the targets: most lie on lines
+        double last = 1.0, before = 1.0;  // place / target: targets along a line change it evenly
         for (size_t i = 0; i < targets.size(); ++i) {
             const double target = targets.data()[i], place = map.inverse(target, (2.0 * last - before) * target);
             places.data()[i] = place;
@@ -224,7 +224,7 @@ void sight_normals(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tu
     });
 }
 
-// of_sight(v, projection, pose) of all sights from `first` to `last`, each for itself; false where any of them is.
+// Calls of_sight(v, projection, pose) for each sight from `first` to `last`; returns false if any call does.
 template <class OfSight>
 bool each_sight(int64_t first, int64_t last, const OpticsGiven& optics, const Poses& poses, OfSight of_sight) {
     require(poses.shape(0) >= static_cast<size_t>(last), "there are fewer poses");
@@ -237,7 +237,7 @@ bool each_sight(int64_t first, int64_t last, const OpticsGiven& optics, const Po
     });
 }
 
-// rows: where each observation's residuals go, or empty: in order.
+// rows: where each observation's residuals go; empty: in order.
 template <class Given, int many>
 void find_residuals(int64_t first, int64_t last, Tuple optics, const Poses& poses, Tuple columns, const Bounds& rows,
                     const Filled<N, many>& residuals) {
@@ -252,7 +252,7 @@ void find_residuals(int64_t first, int64_t last, Tuple optics, const Poses& pose
     });
 }
 
-// normals: of curves alone.
+// normals: only for curves.
 template <class Given, int many>
 bool find_rows(Tuple optics, const Poses& poses, Tuple columns, const Filled<N, many, N>& rows,
                const Filled<N, 2>& normals) {
@@ -353,7 +353,7 @@ int64_t strands_left(const Read<N, N>& values, const Bounds& bounds, const Bound
     });
 }
 
-// Whether the other build, for processors of x86-64-v3, runs here, and there is one.
+// Whether there is another build, for processors of x86-64-v3, and this processor can run it.
 bool has_avx2() {
 #if !defined(CERES_CAL_HAS_V3)
     return false;

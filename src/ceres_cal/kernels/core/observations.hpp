@@ -1,4 +1,4 @@
-// What the kernels are handed, as plain pointers: see `kernels/__init__.py`, which says what each is.
+// The arguments of the kernels as plain pointers: see `kernels/__init__.py`, which describes each.
 #pragma once
 
 #include <cmath>
@@ -8,10 +8,11 @@
 
 namespace ceres_cal {
 
-constexpr int BUILT = 10;    // structure numbers at most that move a point
-constexpr int ON_TRACK = 3;  // and a track
+constexpr int BUILT = 10;    // most structure numbers that move a point
+constexpr int ON_TRACK = 3;  // most structure numbers that move a track
 
-// RESIDUALS of each observation, and by how many structure numbers at most it is MOVED; moved(k): where k's slots are.
+// RESIDUALS: number of residuals of each observation. MOVED: most structure numbers that move it. moved(k): row of k's
+// slots.
 struct Points {
     static constexpr int RESIDUALS = 2, MOVED = BUILT;
     const int64_t* bounds;
@@ -33,7 +34,7 @@ struct Curves {
     int64_t moved(int64_t k) const { return track[k]; }
 };
 
-// of_chunk(start, n) of all chunks of a sight, each about as long; false where any of them is.
+// Calls of_chunk(start, n) for all chunks of a sight, of about equal length; returns false if any call does.
 template <class Columns, class OfChunk>
 inline bool all_chunks(const Columns& seen, int64_t sight, OfChunk of_chunk) {
     bool good = true;
@@ -52,14 +53,14 @@ struct Loss {
     double scale;
 };
 
-// What sights show, and the loss that it is judged by.
+// The observations of sights, and the loss with which they are judged.
 struct Observed {
     Points points;
     Curves curves;
     Loss loss;
 };
 
-// Which numbers take part: A is [free intrinsics | structure | 6 pose | residual].
+// The numbers that take part: the columns of A are [free intrinsics | structure | 6 pose | residual].
 struct Unknowns {
     const int64_t* free;
     int count, structure;
@@ -69,18 +70,18 @@ struct Unknowns {
 
 // ---- the robust losses, as Ceres defines them ----
 
-// rho and its derivative at a squared residual s; and sqrt(1 + 2 s rho'' / rho'), how the loss' own bend shortens the
-// Jacobian along the residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3). In place of
-// Cauchy's rho, b log(1 + s / b), stands s / b, of which `sum_of_logs` makes it.
+// rho and its derivative at a squared residual s; and sqrt(1 + 2 s rho'' / rho'), the factor by which the curvature of
+// the loss shortens the Jacobian along the residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section
+// 4.3). For Cauchy's loss, rho = b log(1 + s / b) is given as s / b, from which `sum_of_logs` computes it.
 //
-// 1 for the redescending losses: along their bend a step may climb.
+// The bend is 1 for redescending losses: along their curvature a step may climb.
 struct Robust {
     double rho, slope, bend = 1.0;
 };
 
 template <LossCode code>
 inline Robust robust(double scale, double squared) {
-    constexpr double STRAIGHT = 0.1;  // in place of 0, where a loss has no curvature left
+    constexpr double STRAIGHT = 0.1;  // instead of 0, where a loss has no curvature left
     const double b = scale * scale;
     if constexpr (code == LossCode::huber) {
         const double root = std::sqrt(squared);
@@ -99,8 +100,9 @@ inline Robust robust(double scale, double squared) {
     }
 }
 
-// Sum of log(1 + more) over n numbers, a multiple of LANES: a logarithm of each takes longer than all else that a
-// residual needs. Of few factors at once, so that no product overflows; less one, so that none is rounded away.
+// Sum of log(1 + more) over n numbers, a multiple of LANES: a logarithm of each would take longer than everything else
+// for a residual. Few factors are multiplied at once, so that no product overflows; products are kept minus one, so
+// that none is lost in rounding.
 inline double sum_of_logs(int n, const double* more) {
     constexpr int FACTORS = 8;
     double sum = 0.0;
@@ -117,7 +119,7 @@ inline double sum_of_logs(int n, const double* more) {
 template <LossCode code>
 using Chosen = std::integral_constant<LossCode, code>;
 
-// function of the loss's code as a type, so that what it does with many residuals has no branches.
+// Calls a function with the loss's code as a type, so that its loops over many residuals have no branches.
 template <class Function>
 inline auto with_loss(LossCode code, Function function) {
     switch (code) {

@@ -8,15 +8,15 @@
 
 namespace ceres_cal {
 
-// Of at least one number, which it orders.
+// The median of at least one number; it reorders them.
 inline double median(std::vector<double>& values) {
     const auto half = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-    const auto before = [](double a, double b) { return a < b || (b != b && a == a); };  // what is no number comes last
+    const auto before = [](double a, double b) { return a < b || (b != b && a == a); };  // NaN comes last
     std::nth_element(values.begin(), half, values.end(), before);
     return values.size() % 2 == 1 ? *half : 0.5 * (*std::max_element(values.begin(), half, before) + *half);
 }
 
-// The unit vector that `normal` (SIZE squared, lower triangle) shrinks most, by inverse iteration from h.
+// The eigenvector of the least eigenvalue of `normal` (SIZE squared, lower triangle), by inverse iteration from h.
 template <int SIZE>
 void least_direction(double* normal, double* h, int rounds) {
     double upper[SIZE * SIZE], trace = 0.0;
@@ -33,19 +33,19 @@ void least_direction(double* normal, double* h, int rounds) {
 
 class Homographies {
   public:
-    // profile: c_k of w = 1 + sum c_k r^2k, which makes q = (p, w); p and r are offsets and their lengths over `unit`.
-    // wrong: medians of the errors beyond which one is a wrong label's.
+    // profile: c_k of w = 1 + sum c_k r^2k, with q = (p, w); p and r are offsets and their lengths over `unit`. wrong:
+    // multiple of the median error above which an error is a wrong label's.
     Homographies(const double* profile, int terms, double unit, double wrong)
         : profile_(profile), terms_(terms), unit_(unit), wrong_(wrong) {}
 
-    // H (3, 3) of one sight with q ~ H (x, y, 1), sign by most of its points, and each point's error (n).
+    // Computes H (3, 3) of one sight with q ~ H (x, y, 1), with the sign of most of its points, and errors (n).
     void fit(int64_t n, const double* plane, const double* offsets, double* homography, double* errors) {
         constexpr int PATIENCE = 8;  // rounds of reweighting where some points do not fit
         for (std::vector<double>* one : {&x_, &y_, &a_, &b_, &c_}) one->resize(static_cast<size_t>(n));
         weights_.assign(static_cast<size_t>(n), 1.0);
         double lift[3], normal[81], h[9];
         load(n, plane, offsets, lift);
-        for (int i = 0; i < 9; ++i) h[i] = 1.0 + 0.1 * i;  // anything: what the moments shrink more vanishes soon
+        for (int i = 0; i < 9; ++i) h[i] = 1.0 + 0.1 * i;  // any start: its other components vanish soon
         for (int round = 0; round < PATIENCE; ++round) {
             add_moments(n, normal);
             least_direction<9>(normal, h, 4);
@@ -66,7 +66,7 @@ class Homographies {
     }
 
   private:
-    // x and y: the plane's points with their centroid at 0 and unit spread, lift (3): centroid and 1 / spread; and q.
+    // x and y: the plane's points with centroid 0 and unit spread. lift (3): centroid and 1 / spread. Also computes q.
     void load(int64_t n, const double* plane, const double* offsets, double* lift) {
         double spread = 0.0;
         lift[0] = lift[1] = 0.0;
@@ -83,7 +83,7 @@ class Homographies {
         for (int64_t i = 0; i < n; ++i) x_[i] *= lift[2], y_[i] *= lift[2];
     }
 
-    // normal (9, 9), lower triangle: of q_w (h1 . X) - q_x (h3 . X) = 0 and q_w (h2 . X) - q_y (h3 . X) = 0.
+    // normal (9, 9), lower triangle, of q_w (h1 . X) - q_x (h3 . X) = 0 and q_w (h2 . X) - q_y (h3 . X) = 0.
     void add_moments(int64_t n, double* normal) const {
         constexpr int PLACES[5][2] = {{0, 0}, {3, 3}, {6, 0}, {6, 3}, {6, 6}};
         constexpr int PRODUCTS[3][3] = {{0, 1, 3}, {1, 2, 4}, {3, 4, 5}};
@@ -104,7 +104,7 @@ class Homographies {
         }
     }
 
-    // Distance of each measured point from where h sends it, in q's unit, and 1 / depth^2 as weights.
+    // Distance of each measured point from its image under h, in the unit of q, and 1 / depth^2 as weights.
     void judge(int64_t n, double* h, double* errors) {
         int64_t agree = 0;
         for (int64_t i = 0; i < n; ++i) {
@@ -124,10 +124,11 @@ class Homographies {
     std::vector<double> x_, y_, a_, b_, c_, weights_, ordered_;
 };
 
-// The profile of a lens from sights of points, whatever it is: `closed_forms.radial_alignment` has the equations.
+// The profile of a lens from sights of points, for any radial distortion: `closed_forms.radial_alignment` has the
+// equations.
 class Alignment {
   public:
-    // bounds (sights + 1), offsets in units of what profiles are of.
+    // bounds (sights + 1); unit: the px that are the unit of the profile.
     Alignment(int64_t sights, const int64_t* bounds, const double* plane, const double* offsets, double unit, int terms)
         : sights_(sights), bounds_(bounds), terms_(terms), size_(4 + terms) {
         const size_t count = static_cast<size_t>(bounds[sights]);
@@ -140,7 +141,7 @@ class Alignment {
             r_[i] = std::sqrt(a_[i] * a_[i] + b_[i] * b_[i]);
             farthest = std::max(farthest, r_[i]);
         }
-        // With few points in a ring its outliers would be the usual there.
+        // In a ring of few points, its outliers would determine the usual error.
         rings_.resize(std::min<size_t>(std::max<size_t>(count / 200, 1), 16));
         const double rings = static_cast<double>(rings_.size());
         for (size_t i = 0; i < count; ++i)
@@ -148,12 +149,13 @@ class Alignment {
         for (int64_t g = 0; g < sights; ++g) load(bounds[g], bounds[g + 1], plane);
     }
 
-    // One round: c (terms) of the profile, each point's error, in units, and what is usual there; and weights by it.
+    // One round: c (terms) of the profile, each point's error, in units, and the usual error there; and weights from
+    // these.
     void fit(double* c, double* errors, double* usual) {
         double reduced[MOST * MOST] = {}, vectors[MOST * MOST];
         for (int64_t g = 0; g < sights_; ++g)
             if (bounds_[g] < bounds_[g + 1]) align(g, reduced);
-        // Least squares without the directions that nothing tells.
+        // Least squares without undetermined directions.
         double right[MOST], largest = 0.0;
         for (int j = 0; j < terms_; ++j) right[j] = reduced[(terms_ + 1) * j + terms_], c[j] = 0.0;
         for (int j = 1; j < terms_; ++j)
@@ -185,7 +187,7 @@ class Alignment {
     static constexpr int MOST = 4 + MOST_TERMS;
     static constexpr double NOTHING = 1e-10;
 
-    // x and y: the plane's points with their centroid at 0 and unit spread.
+    // x and y: the plane's points with centroid 0 and unit spread.
     void load(int64_t first, int64_t last, const double* plane) {
         const double n = static_cast<double>(last - first);
         double centre[2] = {}, spread = 0.0;
@@ -199,7 +201,7 @@ class Alignment {
             x_[i] /= spread, y_[i] /= spread;
     }
 
-    // h1 and h2 of a sight, its u, v and q; how its depth follows c; and what it says of these, added to `reduced`.
+    // h1 and h2 of a sight, its u, v and q, and how its depth follows c; its equations for c are added to `reduced`.
     void align(int64_t g, double* reduced) {
         const size_t first = static_cast<size_t>(bounds_[g]), last = static_cast<size_t>(bounds_[g + 1]);
         double normal[36] = {}, h[6], agree = 0.0, whole = 0.0;
@@ -208,7 +210,7 @@ class Alignment {
                          row[6] = {-b_[i] * x_[i], -b_[i] * y_[i], -b_[i], a_[i] * x_[i], a_[i] * y_[i], a_[i]};
             add_outer(6, w, row, normal);
         }
-        for (int j = 0; j < 6; ++j) h[j] = 1.0 + 0.1 * j;  // anything, as above
+        for (int j = 0; j < 6; ++j) h[j] = 1.0 + 0.1 * j;  // any start, as above
         least_direction<6>(normal, h, 8);
         for (size_t i = first; i < last; ++i) {
             u_[i] = h[0] * x_[i] + h[1] * y_[i] + h[2], v_[i] = h[3] * x_[i] + h[4] * y_[i] + h[5];
@@ -258,7 +260,7 @@ class Alignment {
         }
     }
 
-    // w row row^T, added to the lower triangle; and that mirrored.
+    // Adds w row row^T to the lower triangle; and copies that to the upper one.
     static void add_outer(int size, double w, const double* row, double* to) {
         for (int j = 0; j < size; ++j)
             for (int k = 0; k <= j; ++k) to[size * j + k] += w * row[j] * row[k];

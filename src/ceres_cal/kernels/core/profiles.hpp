@@ -1,4 +1,4 @@
-// The normal equations of edges, or lines of paint, in the pixels around places: see detect/profiles.py, which has the
+// The normal equations of edges, or lines of paint, over the pixels around them: see detect/profiles.py, which has the
 // model.
 #pragma once
 
@@ -17,9 +17,9 @@ inline double polynomial(const double (&c)[terms], double x) {
     return sum;
 }
 
-// The normal distribution and its density: right to 1e-10, in SIMD registers, which a table is not. Chebyshev's
-// polynomial of the density's 32nd root, and a ratio of polynomials for that of what lies beyond to the density
-// (Mills').
+// The normal distribution and its density, accurate to 1e-10, in SIMD registers, in contrast to a table. It uses
+// Chebyshev's polynomial of the density's 32nd root, and a rational function for the ratio of the tail probability to
+// the density (Mills' ratio).
 inline void normal_at(double x, double& high, double& bell) {
     constexpr double END = 8.5, ROOT_2_PI = 2.5066282746310002;
     constexpr double ROOT[] = {0.99999999999891462,    -0.99999999980795506,    0.49999999438103842,
@@ -37,7 +37,7 @@ inline void normal_at(double x, double& high, double& bell) {
     high = 0.5 + std::copysign(0.5 - bell * polynomial(ABOVE, away) / polynomial(BELOW, away), x);
 }
 
-// What blurs and smears the edges of one window, and where they are: `offset` of them all, `edges` beside it.
+// The blur and smear of the edges of one window, and their places: `offset` of all edges, and `edges` beside it.
 struct Blurred {
     double blur, smear, lean, offset;
     const double *edges, *heights;
@@ -45,7 +45,7 @@ struct Blurred {
 
 class ProfileEquations {
   public:
-    // moves: whether places are asked for, too, by given heights; free: how many of blur, stretch and smear are.
+    // moves: whether places are unknowns, too, with given heights. free: how many of blur, stretch and smear are.
     ProfileEquations(int edges, bool moves, int free, bool smears)
         : edges_(edges),
           moves_(moves),
@@ -59,7 +59,7 @@ class ProfileEquations {
 
     int size() const { return size_; }
 
-    // normal (P, P) and right (P) of one window's pixels.
+    // Computes normal (P, P) and right (P) of one window's pixels.
     void add_up(const Blurred& at, const double* distance, const double* values, int64_t pixels, double* normal,
                 double* right) {
         std::fill_n(normal, size_ * size_, 0.0), std::fill_n(right, size_, 0.0);
@@ -106,7 +106,7 @@ class ProfileEquations {
         }
     }
 
-    // How high a step at `edge` is, and the derivatives of that by the distance and by the logarithm of the blur.
+    // The value of a step at `edge`, and its derivatives by the distance and by the logarithm of the blur.
     void step(const Blurred& at, double edge, int filled, Lane& high) {
         const double sharp = 1.0 / at.blur, *weight = weight_.value, *away = away_.value;
         double *up_to = high.value, *place = by_place_.value, *wider = by_blur_.value, *longer = by_smear_.value;
@@ -118,7 +118,7 @@ class ProfileEquations {
         });
     }
 
-    // The same, and by the logarithm of the smear, which is a mean over its length: integrals of Phi make it.
+    // The same, and by the logarithm of the smear, which is a mean over its length: it follows from integrals of Phi.
     void smeared_step(const Blurred& at, double edge, int filled, Lane& high) {
         const double sharp = 1.0 / at.blur, lean = at.lean, mean = 0.5 - lean / 6.0;
         const double length = at.smear * sharp, q = 2.0 * lean / (length * length);

@@ -1,6 +1,6 @@
-// A chunk of observations before the camera: where they are shown, where the feet on curves are, and the derivatives.
+// A chunk of observations in front of the camera: its images, the feet on curves, and the derivatives.
 //
-// The pose is (3, 4) [R t]; its derivatives are left perturbations in the camera frame, (dw x R X) + dt.
+// The pose is (3, 4) [R t]; derivatives by it are left perturbations in the camera frame, (dw x R X) + dt.
 #pragma once
 
 #include <algorithm>
@@ -22,14 +22,14 @@ class Projection {
           shown_(new bool[last_row + 1]) {}
 
     Lens& lens;
-    const int pose_row, last_row;  // after the intrinsics' rows the pose's six, then one for the residual
+    const int pose_row, last_row;  // after the rows of the intrinsics come the pose's six, then one for the residual
 
     Rows rows;
     Image image;
-    // Of curves: tangents dC/ds in the frame of the target, and the image normal.
+    // For curves: tangents dC/ds in the frame of the target, and the image normal.
     Lane tangent_x, tangent_y, tangent_z, normal_x, normal_y;
 
-    // The images of n points; false where any of them cannot be projected.
+    // Computes the images of n points; returns false if any of them cannot be projected.
     bool show(int64_t start, int n, const double* pose, const Points& points) {
         fill(start, n, points.pixels);
         for (int i = 0; i < rows.n; ++i) {
@@ -40,10 +40,11 @@ class Projection {
         return lens.project(rows.n, rays_, image);
     }
 
-    // The feet of the perpendiculars from n pixels, tau . (project(C(s)) - p) = 0 (design, section 5), to curves.feet.
+    // Finds the feet of the perpendiculars from n pixels, tau . (project(C(s)) - p) = 0 (design, section 5), and stores
+    // them in curves.feet.
     //
-    // Gauss-Newton steps whose slope is corrected by the secant, so that the curve's own bend is seen without second
-    // derivatives. False, and nothing moved, where any curve cannot be projected.
+    // Gauss-Newton steps have their slope corrected by the secant, so that the curvature of the curve is included
+    // without second derivatives. Returns false, and moves nothing, if any curve cannot be projected.
     bool show(int64_t start, int n, const double* pose, const Curves& curves) {
         fill(start, n, curves.pixels);
         load_tracks(start, n, curves);
@@ -62,15 +63,15 @@ class Projection {
         return true;
     }
 
-    // The image of the point, or of the foot, less the pixel, px.
+    // The image of the point, or of the foot, minus the pixel, px.
     double off_x(int i) const { return lens.cx + image.x[i] - pixel_x_[i]; }
     double off_y(int i) const { return lens.cy + lens.aspect * image.y[i] - pixel_y_[i]; }
 
-    // The signed distance along the normal. By the envelope theorem its derivative is that of the projected foot with s
-    // held, along the normal.
+    // The signed distance along the normal. By the envelope theorem its derivative is that of the projected foot, with
+    // s held, along the normal.
     double distance(int i) const { return normal_x[i] * off_x(i) + normal_y[i] * off_y(i); }
 
-    // The rows: derivatives of the chunk's pixels by the intrinsics (but not where the pose alone is free) and the
+    // Fills the rows: derivatives of the chunk's pixels by the intrinsics (unless only the pose is free) and by the
     // pose.
     void differentiate(bool alone) {
         if (!alone) lens.fill(image, rows);
@@ -89,12 +90,12 @@ class Projection {
         component(lens.aspect, image.yx, image.yy, image.yz, n);
     }
 
-    // Where the foot of observation k, the chunk's i, goes: rows (x, y, z) for each structure number of its track. To
-    // the left of a segment; with the centre and outwards on an arc.
+    // Motions of the foot of observation k, the chunk's i: rows (x, y, z) for each structure number of its track. For a
+    // segment to the left; for an arc with the centre, and outwards.
     void directions(const Curves& curves, int64_t k, int i, double (&rows)[BUILT][3]) const {
         const int64_t track = curves.track[k];
         const bool arc = curves.is_arc[track];
-        // The tangent's right side is outside; turned by a quarter it is the radius' own direction.
+        // The tangent's right side is outside; turned by a quarter it is the direction of the radius.
         const double x = arc ? -tangent_x[i] : curves.tracks[9 * track + 3];
         const double y = arc ? -tangent_y[i] : curves.tracks[9 * track + 4];
         const double length = std::sqrt(x * x + y * y) + 1e-300;
@@ -103,8 +104,8 @@ class Projection {
         left[0] = -y / length, left[1] = x / length;
     }
 
-    // Where a point goes: along x and y, along z as much as each part of its board's warp says, and again along x and
-    // y as much as the board's stretches say.
+    // Motions of a point: along x and y, along z in proportion to each part of its board's warp, and again along x and
+    // y in proportion to the board's stretches.
     void directions(const Points& points, int64_t k, int, double (&rows)[BUILT][3]) const {
         rows[0][0] = rows[1][1] = 1.0;
         const double* bends = points.bends + (BUILT - 2) * k - 2;
@@ -159,7 +160,7 @@ class Projection {
         });
     }
 
-    // Where each foot goes next; the answer is how far the farthest goes, px.
+    // Computes the next step of each foot; returns the longest, px.
     double find_steps(const double* pose, bool again) {
         const double aspect = lens.aspect;
         double worst = 0.0;
@@ -181,7 +182,7 @@ class Projection {
         return worst;
     }
 
-    std::unique_ptr<Lane[]> buffer_;  // aligned as they are
+    std::unique_ptr<Lane[]> buffer_;  // Lane keeps its alignment
     std::unique_ptr<bool[]> shown_;
     Rays rays_;
     Lane x_, y_, z_, turned_x_, turned_y_, turned_z_;

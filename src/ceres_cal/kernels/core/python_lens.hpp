@@ -1,4 +1,4 @@
-// A lens that Python has alone: NumPy's formulas, a call for each chunk.
+// A lens that exists only in Python: its NumPy formulas are called once for each chunk.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -12,7 +12,7 @@ namespace ceres_cal {
 
 namespace nb = nanobind;
 
-// Made, used and ended while its caller keeps the lens; only what it calls has Python's lock.
+// It is made, used and destroyed while its caller keeps the lens. Only the calls into Python hold Python's lock.
 class PythonLens final : public Lens {
   public:
     // lens: `scene.lens.Lens` with the coefficients of the intrinsics.
@@ -48,7 +48,7 @@ class PythonLens final : public Lens {
   private:
     using Found = nb::ndarray<const double, nb::shape<-1, 2, -1>, nb::c_contig, nb::device::cpu>;
 
-    // lens.method(rays, phi, *more), (n, 2, columns).
+    // Returns lens.method(rays, phi, *more), (n, 2, columns).
     Found ask(const char* method, int columns, const nb::tuple& more) const {
         nb::ndarray<nb::numpy, const double, nb::ndim<2>> rays(rays_, {static_cast<size_t>(count_), 3}, nb::handle(),
                                                                {1, CHUNK});

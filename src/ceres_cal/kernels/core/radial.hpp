@@ -1,4 +1,4 @@
-// The paper's lens: see radial.py. Form: the place of p1 among the intrinsics, 0 for none, and its powers.
+// The paper's lens: see radial.py. Form: the index of p1 in the intrinsics (0 for none), then the powers.
 #pragma once
 
 #include <algorithm>
@@ -23,15 +23,15 @@ class Radial final : public Lens {
         for (size_t k = 0; k < powers_.size(); ++k)
             dense_[static_cast<size_t>(powers_[k]) - 1] += from.intrinsics[4 + static_cast<int>(k)];
         if (tangential_ > 0) across_ = {from.intrinsics[tangential_], from.intrinsics[tangential_ + 1]};
-        // In the worst direction the decentring takes 3 |p| r^2 off the radius.
+        // In the worst direction the decentring reduces the radius by 3 |p| r^2.
         std::vector<double> worst = dense_;
         worst.resize(std::max<size_t>(2, worst.size()));
         worst[1] -= 3.0 * std::hypot(across_.p1, across_.p2) * unit / phi;
         limit_ = growing_until(worst.data(), static_cast<int>(worst.size()), FAR, FAR);
     }
 
-    // s (1 + c_2 s + ...) = phi |u| / unit solved for the radius s, in half image diagonals; a decentring moves the
-    // measured point from there.
+    // Solves s (1 + c_2 s + ...) = phi |u| / unit for the radius s, in half image diagonals; a decentring then moves
+    // the measured point.
     bool distort(int n, const Rays& rays, Image& image) override {
         each(n, [&](int i) {
             const double iz = 1.0 / rays.z[i], u = rays.x[i] * iz, v = rays.y[i] * iz;
@@ -42,7 +42,7 @@ class Radial final : public Lens {
         });
         double worst = 1.0;
         for (int step = 0; step < STEPS && !(worst < CLOSE); ++step) worst = newton_step(n);
-        // From where the radius folds a decentring may lead inwards or past it.
+        // At the radius where the map folds, a decentring could lead inwards or past the fold.
         const double inside = tangential_ > 0 ? 0.99 * limit_ : limit_;
         each(n, [&](int i) {
             s_[i] = std::min(s_[i], inside);
@@ -92,10 +92,10 @@ class Radial final : public Lens {
 
   private:
     static constexpr double FAR = 6.0;     // half image diagonals: nothing is observed farther out
-    static constexpr double CLOSE = 1e-8;  // the step just taken has squared this
+    static constexpr double CLOSE = 1e-8;  // Newton's last step: the error is of the order of its square
     static constexpr int STEPS = 25, MOST = 64;
 
-    // The ideal point's derivatives by the measured one, symmetric, and their inverse.
+    // The derivatives of the ideal point by the measured one, which are symmetric, and their inverse.
     void invert(int n) {
         const Decentring across = across_;
         each(n, [&](int i) {
@@ -107,11 +107,11 @@ class Radial final : public Lens {
         });
     }
 
-    // One step of the measured point towards x (d_0 + d_1 s + ...) - its decentring = ideal; how far the farthest one
-    // went, in half image diagonals.
+    // One Newton step of the measured point towards x (d_0 + d_1 s + ...) - its decentring = ideal. Returns the largest
+    // step, in half image diagonals.
     double move(int n) {
         const Decentring across = across_;
-        const double longest = 0.1 * limit_;  // at the fold the map hardly grows, and a whole step would end behind it
+        const double longest = 0.1 * limit_;  // at the fold the map hardly grows, and a full step would end behind it
         double worst = 0.0;
         each(n, [&](int i) {
             const double a = x_[i] / phi, b = y_[i] / phi;
@@ -126,7 +126,7 @@ class Radial final : public Lens {
         return worst;
     }
 
-    // Rows of the measured point's derivatives, of the ideal one's that `by` fills.
+    // Fills rows of derivatives of the measured point, from those of the ideal point, which `by` gives.
     template <class By>
     void fill(int n, double* x, double* y, By by) {
         each(n, [&](int i) {
@@ -136,7 +136,7 @@ class Radial final : public Lens {
         });
     }
 
-    // d_0 + d_1 s + ..., and the slope of s times that.
+    // value = d_0 + d_1 s + ..., and slope = d/ds of s times that.
     void evaluate(int n) {
         const int top = static_cast<int>(dense_.size()) - 1;
         const double* dense = dense_.data();
@@ -147,7 +147,7 @@ class Radial final : public Lens {
         }
     }
 
-    // One step from s towards s (d_0 + d_1 s + ...) = ideal; how far the farthest one went.
+    // One Newton step of s towards s (d_0 + d_1 s + ...) = ideal. Returns the largest step.
     double newton_step(int n) {
         evaluate(n);
         double worst = 0.0;

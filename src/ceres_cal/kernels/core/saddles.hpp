@@ -1,5 +1,5 @@
 // The saddles around corners of a chessboard, each fitted to the pixels of a disc: see detect/saddles.py, which has the
-// model. What edges are in the picture, tanh makes of their distances.
+// model. Edges in the picture are tanh of the distances from them.
 #pragma once
 
 #include <limits>
@@ -15,7 +15,7 @@ struct Picture {
     int64_t height, width;
 };
 
-// By Lambert's continued fraction of an eighth, doubled three times: right to 1e-9, in SIMD registers.
+// tanh by Lambert's continued fraction of an eighth, doubled three times: accurate to 1e-9, in SIMD registers.
 inline double smooth_step(double x) {
     constexpr double END = 10.0;
     const double y = 0.125 * std::max(-END, std::min(x, END)), y2 = y * y;
@@ -30,14 +30,14 @@ inline double smooth_step(double x) {
 
 class Saddles {
   public:
-    // Numbers of a start: see SIZE's places, those after the angles NaN where they are not known; then the bends of
-    // both edges and the disc's radius. Of a fit: the same places, then the root mean square of what is left, and the
-    // standard deviations of x and y where noise in a pixel has one of 1.
+    // Numbers of a start: those of `Place`, where the ones after the angles are NaN if unknown; then the bends of both
+    // edges and the disc's radius. Numbers of a fit: those of `Place`, then the root mean square of the residuals, and
+    // the standard deviations of x and y for noise of 1 in each pixel.
     static constexpr int SIZE = 11, START = SIZE + 3, FITTED = SIZE + 3;
 
     explicit Saddles(const Picture& picture) : picture_(picture) {}
 
-    // Where light and sharpness are not known every other pixel each way tells them first.
+    // Where light and sharpness are unknown, they are first fitted to every other pixel along both axes.
     void fit(const double* start, double* fitted) {
         constexpr double LARGE_PX = 8.0, ROUGH_PX = 2e-2, SETTLED_PX = 1e-3;
         std::fill_n(fitted, FITTED, NO_CORNER);
@@ -59,7 +59,8 @@ class Saddles {
     static constexpr int STRIDE = SIZE + 4;
     static constexpr double FARTHEST_PX = 1e3, NO_CORNER = std::numeric_limits<double>::quiet_NaN();
 
-    // The pixels of the disc, each `every`-th of a row and a column; false where its middle is not in the picture.
+    // Selects the pixels of the disc, each `every`-th of a row and a column; returns false if its centre is not in the
+    // picture.
     bool cut(const double* start, int64_t every) {
         const double radius = start[SIZE + 2];
         const auto is_in = [](double place, int64_t size) {
@@ -80,7 +81,7 @@ class Saddles {
                 const double dx = static_cast<double>(x) - start[0], dy = static_cast<double>(y) - start[1];
                 xs[many] = static_cast<double>(x), ys[many] = static_cast<double>(y);
                 levels[many] = picture_.levels[picture_.width * y + x];
-                many += dx * dx + dy * dy <= radius * radius;  // the next one takes the place of what is outside
+                many += dx * dx + dy * dy <= radius * radius;  // a pixel outside is overwritten by the next one
             }
         for (double* one : {xs, ys, levels}) std::fill_n(one + many, LANES, one[many - 1]);
         std::fill_n(weight_.data(), many, 1.0), std::fill_n(weight_.data() + many, LANES, 0.0);
@@ -89,7 +90,7 @@ class Saddles {
         return true;
     }
 
-    // Levenberg and Marquardt's steps until one hardly moves the corner: of that one the cost is foretold.
+    // Levenberg-Marquardt steps until one hardly moves the corner; the cost after that step is predicted.
     double settle(double settled_px, double* now) {
         constexpr int STEPS = 20;
         constexpr double BLUNTEST = 0.05, SHARPEST = 3.0;
@@ -115,7 +116,7 @@ class Saddles {
         return std::max(cost, 0.0);
     }
 
-    // Mean and contrast of the disc, and the equations there.
+    // Initial mean and contrast of the disc, and the equations there.
     double guess(double* now) {
         constexpr double DIFFUSE = 0.7;
         now[SHARP] = DIFFUSE, std::fill(now + MEAN, now + SIZE, 0.0);
@@ -128,7 +129,7 @@ class Saddles {
 
     double at(int row, int column) const { return normal_.data()[STRIDE * row + column]; }
 
-    // The equations of what is left at `now`; the answer is its square.
+    // Adds up the equations of the residuals at `now`; returns the sum of squares.
     double add_up(const double* now) {
         double* own[SIZE + 1];
         for (int k = 0; k <= SIZE; ++k) own[k] = rows_[k].value;
@@ -143,7 +144,7 @@ class Saddles {
         return at(LEFT, LEFT);
     }
 
-    // The rows of n pixels, a multiple of LANES: derivatives of the model, and what it leaves.
+    // Computes the rows of n pixels, a multiple of LANES: derivatives of the model, and the residuals.
     void differentiate(size_t start, int n, const double* now) {
         const double *x = x_.data() + start, *y = y_.data() + start, *level = level_.data() + start;
         const double *weight = weight_.data() + start, at_x = now[X], at_y = now[Y];
@@ -174,7 +175,7 @@ class Saddles {
 
     void factor(double damping) {
         std::copy(normal_.begin(), normal_.end(), products_);
-        // The last term keeps a disc without any contrast solvable; it then stays where it is.
+        // The last term keeps a disc without any contrast solvable; its numbers then stay unchanged.
         for (int k = 0; k < SIZE; ++k) products_[(STRIDE + 1) * k] += damping * products_[(STRIDE + 1) * k] + 1e-12;
         cholesky(SIZE, products_, STRIDE, upper_);
     }

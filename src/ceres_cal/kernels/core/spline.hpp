@@ -1,8 +1,9 @@
-// A lens without a formula: see spline.py. Places, radii and displacements are in rims, or in the solver's unit.
+// A lens without a formula: see spline.py. Places, radii and displacements are in units of the rim, or in the solver's
+// unit.
 //
-// Form: where among the intrinsics Conrady's decentring and the surface are, 0 for nowhere; the table of the B-splines'
-// pieces (see b_splines.py), coefficients by power, those of all pieces of an interval side by side; of each monomial
-// c q^m conj(q)^n the place of c among the intrinsics, m and n.
+// Form: the indices of Conrady's decentring and of the surface in the intrinsics, 0 for none; the table of the
+// B-splines' pieces (see b_splines.py), coefficients by power, those of all pieces of an interval side by side; for
+// each monomial c q^m conj(q)^n the index of c in the intrinsics, m and n.
 #pragma once
 
 #include <algorithm>
@@ -16,13 +17,13 @@ namespace ceres_cal {
 
 // A surface of cubic B-splines on a grid: see surface.py.
 //
-// Among the intrinsics, from the place `at` on: half the grid's width and height, in the lens's units, then the
+// Its intrinsics, from the index `at` on, are half the grid's width and height, in the lens's units, then the
 // coefficients of the x and the y displacement of each node, column after column.
 class Surface {
   public:
     static constexpr int COLUMNS = 16, ROWS = 12, HEAD = 2, COUNT = HEAD + 2 * COLUMNS * ROWS;
 
-    // What displaces a place: x and y, and their derivatives by the place's u and v.
+    // The displacement of a place, x and y, and its derivatives by the place's u and v.
     struct Displacement {
         double x = 0.0, y = 0.0, xu = 0.0, xv = 0.0, yu = 0.0, yv = 0.0;
     };
@@ -53,7 +54,7 @@ class Surface {
         return sum;
     }
 
-    // Derivatives of the pixels that were looked up last by the numbers of the surface.
+    // Derivatives of the pixels that were looked up last, by the numbers of the surface.
     void differentiate(int count, double unit, double aspect, const Rows& rows) const {
         for (int k = 0; k < HEAD; ++k) rows.open(at_ + k);
         for (int i = 0; i < count; ++i) {
@@ -73,17 +74,17 @@ class Surface {
 
   private:
     struct Place {
-        int first;  // of the sixteen nodes
+        int first;  // the first of the sixteen nodes
         double u, v, along[4], along_slope[4], down[4], down_slope[4];
         Displacement sum;
     };
 
-    static double side(double given) { return given > 0.0 ? given : 1.0; }  // 0: not set yet, and nothing is displaced
+    static double side(double given) { return given > 0.0 ? given : 1.0; }  // 0: not set yet, without displacements
 
-    // Of a place from -1 to 1: the first of the four nodes, their weights, and the slopes of these (0 beyond).
+    // The first of the four nodes of a place from -1 to 1, their weights, and the slopes of these (0 beyond).
     static int cell(double place, int count, double per_side, double* weight, double* slope) {
         const double cells = 0.5 * (count - 3),
-                     inside = std::min(1.0, std::max(-1.0, place));  // a number, whatever the place
+                     inside = std::min(1.0, std::max(-1.0, place));  // a number even if the place is NaN
         const int first = std::min(static_cast<int>((inside + 1.0) * cells), count - 4);
         const double t = (inside + 1.0) * cells - first, rest = 1.0 - t;
         const double per = inside == place ? cells * per_side : 0.0;
@@ -99,7 +100,7 @@ class Surface {
     }
 
     int at_;
-    const double* nodes_;  // the caller's, who keeps them
+    const double* nodes_;  // owned by the caller
     double wide_, high_;
     Place places_[CHUNK];
 };
@@ -141,13 +142,13 @@ class Spline final : public Lens {
         add_conrady(n);
         if (!monomials_.empty()) add_monomials(n);
         if (surface_) add_surface(n);
-        for (int i = 0; i < n; ++i) add_profile(i);  // by itself: its look-up keeps the rest from SIMD registers
+        for (int i = 0; i < n; ++i) add_profile(i);  // in a loop of its own: its look-up prevents SIMD
         int bad = 0;
         each(n, [&](int i) {
             const double x = rays.x[i], y = rays.y[i], z = rays.z[i], u = u_[i], v = v_[i], s = s_[i];
             const double length = length_[i], per_radius = 1.0 / (radius_[i] + TINY), per_length = 1.0 / length;
             const double stretch = value_[i] * per_radius, bend = (slope_[i] - stretch) * per_radius * per_radius;
-            // Derivatives by q and by its conjugate become those by x and y.
+            // Derivatives by q and by its conjugate are converted to those by x and y.
             const double first_x = first_x_[i] + second_x_[i], first_y = first_y_[i] + second_y_[i];
             const double other_x = first_x_[i] - second_x_[i], other_y = first_y_[i] - second_y_[i];
             const double jxx = rim + stretch + bend * u * u + first_x, jyy = rim + stretch + bend * v * v + other_x;
@@ -202,22 +203,22 @@ class Spline final : public Lens {
   private:
     static constexpr int INTERVALS = 8, DEGREE = 5, ORDER = DEGREE + 1, COUNT = INTERVALS + DEGREE - 2;
     static constexpr int CONRADY = 3, MOST = 9, HEAD = 2, TABLE = INTERVALS * ORDER * ORDER;
-    static constexpr double END = 2.0;  // rims: nothing is observed farther out
+    static constexpr double END = 2.0;  // in units of the rim: nothing is observed farther out
 
     struct Monomial {
         int at, m, n;
         double re, im;
     };
 
-    // The interval of a radius, and how far into it that lies.
+    // The interval of a radius, and the position t in it.
     static int interval(double u, double& t) {
-        const double inside = std::min(1.0, u) * INTERVALS;  // a number, whatever the radius
+        const double inside = std::min(1.0, u) * INTERVALS;  // a number even if the radius is NaN
         const int j = std::min(static_cast<int>(inside), INTERVALS - 1);
         t = inside - j;
         return j;
     }
 
-    // G and its slope, straight on beyond the last knot.
+    // G and its slope; a straight line beyond the last knot.
     void add_profile(int i) {
         double t = 0.0, slope = 0.0;
         const double* own = profile_[interval(radius_[i], t)];
@@ -289,7 +290,7 @@ class Spline final : public Lens {
         }
     }
 
-    // The B-splines at each radius, straight on beyond the last knot, to the x components of their rows.
+    // The B-splines at each radius, straight beyond the last knot, into the x components of their rows.
     void weigh_pieces(const Rows& rows) const {
         for (int i = 0; i < rows.n; ++i) {
             double t, value[ORDER], slope[ORDER] = {};

@@ -1,4 +1,4 @@
-// Errors that go together along strands of observations: what is left of these where they do (effects/likelihood.py).
+// Errors that are correlated along strands of observations: sums for their likelihood (effects/likelihood.py).
 #pragma once
 
 #include <cstdint>
@@ -8,15 +8,15 @@
 
 namespace ceres_cal {
 
-// Sums over strands, shape by shape, for some shares a of the variance that goes together: of correlation
-// R = (1 - a) 1 + a K, along the eigenvectors of K.
+// Sums over strands, shape by shape, for some shares a of correlated variance, with R = (1 - a) 1 + a K, along the
+// eigenvectors of K.
 class Strands {
   public:
     static constexpr int POSE = 6;
 
-    // rows (size, strands, numbers): six of a private placement, those of what is shared, the residual. group:
-    // (strands) whose placement it is, of so many. logs (shares) are added to, and left (shares, rest, rest) is taken
-    // from.
+    // rows (size, strands, numbers): six of a private placement, those of shared numbers, the residual. group:
+    // (strands) number of the placement, out of `groups`. Values are added to logs (shares), and subtracted from left
+    // (shares, rest, rest).
     Strands(int size, int strands, int numbers, const double* rows, const int64_t* group, int64_t groups, int shares,
             const double* share, double* logs, double* left)
         : size_(size),
@@ -32,8 +32,8 @@ class Strands {
           left_(left),
           placed_(static_cast<size_t>(shares * groups * POSE * numbers)) {}
 
-    // The strands from first to last, all of the same eigenvalues (size): log det R, and what private placements have
-    // to do with.
+    // Adds the strands from first to last, all with the same eigenvalues (size): log det R, and the sums with private
+    // placements.
     void add(int first, int last, const double* values) {
         const int own = POSE * numbers_;
         std::vector<double> weights(static_cast<size_t>(shares_) * size_);
@@ -49,7 +49,7 @@ class Strands {
                 for (int m = 0; m < size_; ++m)
                     add_times(count, weight[size_ * a + m], products.data() + count * m, to + apart * a);
         };
-        for (int s = first; s < last; ++s) {  // strands of a group follow one another, or are added one by one
+        for (int s = first; s < last; ++s) {  // strands of a group are best consecutive; else they are added one by one
             if (s == first || group_[s] != group_[s - 1]) poses_.assign(static_cast<size_t>(size_) * own, 0.0);
             for (int m = 0; m < size_; ++m) {
                 const double* x = rows_ + (static_cast<int64_t>(m) * strands_ + s) * numbers_;
@@ -59,7 +59,7 @@ class Strands {
         }
     }
 
-    // Private placements eliminated; how many numbers they are.
+    // Eliminates private placements. Returns the number of their numbers.
     int64_t eliminate() {
         int64_t taken = 0;
         for (int a = 0; a < shares_; ++a)
@@ -78,7 +78,7 @@ class Strands {
 
     double* placed(int a, int64_t g) { return placed_.data() + (a * groups_ + g) * POSE * numbers_; }
 
-    // placed (6, numbers) is one group's: its normal equations, and how they couple with the rest.
+    // placed (6, numbers): the normal equations of one group, and their coupling with the rest.
     int eliminate_one(const double* placed, double& log, double* left) {
         constexpr double NOTHING = 1e-9;
         double normal[POSE * POSE] = {}, upper[POSE * POSE];

@@ -1,5 +1,5 @@
-// What strokes of paint say of a camera over a floor: see detect/photographs/upright.py and matching.py. Single
-// precision is good enough for a share, and fills a register with twice as many numbers.
+// Agreement of strokes of paint with a camera over a floor: see detect/photographs/upright.py and matching.py. Single
+// precision suffices for a share, and fills a register with twice as many numbers.
 #pragma once
 
 #include <cmath>
@@ -11,20 +11,20 @@
 
 namespace ceres_cal {
 
-// exp(-x) for x from 0 on, right to 1e-7: 2 to the power of a whole number, times a polynomial of what is left.
+// exp(-x) for x >= 0, accurate to 1e-7: 2 to the power of a whole number, times a polynomial of the remainder.
 inline float exp_of_minus(float x) {
     const float power = -1.442695041f * x;
     const int32_t whole = static_cast<int32_t>(power);
     const float f = power - static_cast<float>(whole);                 // from -1 to 0
-    const int32_t bits = (std::max<int32_t>(whole, -64) + 127) << 23;  // what is less is nothing
+    const int32_t bits = (std::max<int32_t>(whole, -64) + 127) << 23;  // smaller powers count as this one
     float scale;
     std::memcpy(&scale, &bits, sizeof scale);
     constexpr float A = 0.693143721f, B = 0.240180142f, C = 0.055297357f, D = 0.00920579677f, E = 0.000944903118f;
     return scale * (1.0f + f * (A + f * (B + f * (C + f * (D + f * E)))));
 }
 
-// The share of strokes that run along the axes x or y of a floor, 0 where no more than `least` run along one of them.
-// planes: x, y and z of the normals of the strokes' planes, over the sine by which one may be off; weights: sum to 1.
+// The share of strokes that run along the axes x or y of a floor; 0 if no more than `least` run along one of them.
+// planes: x, y and z of the normals of the strokes' planes, over the sine of their tolerance; weights: of sum 1.
 inline float share_along(int count, const float* planes, const float* weights, const float* x, const float* y,
                          float least) {
     const float *px = planes, *py = px + count, *pz = py + count;
@@ -39,29 +39,29 @@ inline float share_along(int count, const float* planes, const float* weights, c
     return std::min(along_x, along_y) > least ? 0.5f * (along_x + along_y + apart) : 0.0f;
 }
 
-// How near each of `reduced` by `reduced` pixels of a picture is to strokes, 0 to 1.
+// How near each square of `reduced` by `reduced` pixels of a picture is to strokes, from 0 to 1.
 struct NearnessMap {
     const float* plane;
     int64_t height, width;
     float reduced;
 };
 
-// A picture of a lens with ray = (p / phi, 1 + bend |p|^2), p in `unit` px from its centre.
+// A lens and its picture, with ray = (p / phi, 1 + bend |p|^2), p in `unit` px from the centre.
 struct BentLens {
     float bend, phi, unit, x, y, width, height;
 };
 
-// How much a camera shows of lines, and how much of that is near strokes.
+// The length of lines that a camera shows, and the part of it that is near strokes.
 class VisibleLines {
   public:
-    // along: x, y and z of places on the lines as seen from their origin; joined: which belong to the line of the one
-    // before.
+    // along: x, y and z of places on the lines relative to an origin. joined: whether each is on the same line as the
+    // one before.
     VisibleLines(const NearnessMap& near, const BentLens& camera, int count, const float* along, const bool* joined)
         : near_(near), camera_(camera), count_(count), along_(along), joined_(joined), x_(count), y_(count) {}
 
-    // near strokes, shown, px, and the share of the places in view, of a camera that is so far from the origin.
+    // Sets the length near strokes, the shown length (px), and the share of the places in view, for a camera at `feet`.
     void add_up(const float* feet, double* sums) {
-        constexpr float TELLS_PX = 40.0f;  // of a line, as much as one place on it tells
+        constexpr float TELLS_PX = 40.0f;  // largest length of a line, px, for which one place on it counts
         project(feet);
         float near = 0.0f, shown = 0.0f;
         int seen = 0;
@@ -79,7 +79,7 @@ class VisibleLines {
     }
 
   private:
-    // Pixels of the places; not a number behind the camera, or where there are none.
+    // Computes the pixels of the places; NaN behind the camera, or where there is none.
     void project(const float* feet) {
         const float *across = along_, *down = across + count_, *ahead = down + count_;
         float *x = x_.data(), *y = y_.data();
@@ -87,7 +87,7 @@ class VisibleLines {
         for (int i = 0; i < count_; ++i) {
             const float a = across[i] - feet[0], b = down[i] - feet[1], c = ahead[i] - feet[2];
             const float scale = c > 0.0f ? camera_.phi / c : std::numeric_limits<float>::quiet_NaN();
-            // p = ideal (1 + bend p^2): the root that is near ideal for a small bend.
+            // p = ideal (1 + bend p^2): the root that is near the ideal point for a small bend.
             const float root = std::sqrt(1.0f - 4.0f * camera_.bend * (a * a + b * b) * scale * scale);
             const float times = camera_.unit * (2.0f * scale / (1.0f + root));
             x[i] = camera_.x + a * times, y[i] = camera_.y + b * times;

@@ -11,8 +11,8 @@ namespace ceres_cal {
 
 constexpr double NO_ANSWER = std::numeric_limits<double>::quiet_NaN();
 
-// What a direction of the target's frame moves, by what the camera's x, y and z move: the target moved along it moves
-// the point by R times it.
+// The derivative by a motion along a direction of the target's frame, from the derivatives by the camera's x, y and z:
+// a motion of the target along it moves the point by R times it.
 inline double along(const double* by_camera, const double* pose, const double* direction) {
     double sum = 0.0;
     for (int j = 0; j < 3; ++j)
@@ -30,10 +30,10 @@ class Sums {
         own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
     }
 
-    // Sum of rho over a sight, NaN where an observation cannot be projected; A is added up in the lower triangle of
-    // `normal`, of the unknowns' size squared.
+    // Returns the sum of rho over a sight, NaN if an observation cannot be projected. A is added up in the lower
+    // triangle of `normal`, of the unknowns' size squared.
     //
-    // newton: whether A takes rho'' along, for a step, or rho' alone, as the weight that each observation has.
+    // newton: whether A includes rho'', for a step, or only rho', as the weight of each observation.
     double normal_equations(int64_t sight, const double* pose, bool newton, double* normal) {
         std::fill_n(normal, static_cast<size_t>(unknowns_.size()) * unknowns_.size(), 0.0);
         pose_ = pose, newton_ = newton, normal_ = normal, cost_ = 0.0;
@@ -89,8 +89,8 @@ class Sums {
         return cost_ += cost, true;
     }
 
-    // The chunk's rows that take part, and where they stand in A; what the chunk shows nothing of, most of a lens that
-    // has its numbers place by place, is left out.
+    // Chooses the chunk's rows that take part, and their rows in A. Numbers on which the chunk does not depend, as most
+    // of a lens with local coefficients, are left out.
     void choose_rows() {
         shown_.differentiate(unknowns_.count == 0);
         own_.clear(), places_.clear();
@@ -102,7 +102,7 @@ class Sums {
             own_.push_back(shown_.rows.x(shown_.pose_row + k)), places_.push_back(unknowns_.shared() + k);
     }
 
-    // normal += P P^T over the rows' first n places, lower triangle.
+    // normal += P P^T over the first n columns of the rows, lower triangle.
     void add_rows(int n) {
         const int count = static_cast<int>(own_.size()), size = unknowns_.size(), stride = count + 3;
         find_products(own_.data(), count, n, products_.data());
@@ -112,10 +112,10 @@ class Sums {
         }
     }
 
-    // Take the second derivative of rho into the rows: Newton's step on the loss, its gradient unchanged.
+    // Includes the second derivative of rho in the rows: Newton's step on the loss, with unchanged gradient.
     template <LossCode code, int MANY>
     void bend_rows(int n) {
-        constexpr double FLAT = 0.7, MOSTLY_FLAT = 0.5;  // a bend; share beyond which it says nothing of the minimum
+        constexpr double FLAT = 0.7, MOSTLY_FLAT = 0.5;  // a bend; share of such bends above which they mean nothing
         if constexpr (code != LossCode::huber && code != LossCode::soft_l1) return;
         const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
         double *error_x = own_[last], *error_y = error_x + filled;
@@ -132,7 +132,7 @@ class Sums {
         }
     }
 
-    // The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
+    // Adds the share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
     template <class Columns>
     void add_structure(int i, const int32_t* slots, const double (&directions)[BUILT][3]) {
         const int filled = shown_.rows.n, count = static_cast<int>(own_.size()), size = unknowns_.size();
@@ -164,13 +164,13 @@ class Sums {
     alignas(64) double factor_[2 * CHUNK];
     std::vector<double*> own_;
     std::vector<int> places_;
-    std::vector<double> products_;  // room for three rows and columns more
+    std::vector<double> products_;  // with room for three more rows and columns
 };
 
-// ---- every observation for itself, in px: residuals, and the Jacobian that the sums are made of ----
+// ---- single observations, in px: residuals, and the Jacobian of which the sums are made ----
 
-// of_chunk(start, n) for all of a sight's chunks, and of one that fails for each observation alone: none(k) where that
-// fails, too. False where some did.
+// Calls of_chunk(start, n) for all chunks of a sight; if it fails for a chunk, for each of its observations alone; and
+// none(k) where that fails, too. Returns false if any chunk failed.
 template <class Columns, class Chunk, class None>
 inline bool one_by_one_where_some_fail(const Columns& seen, int64_t sight, Chunk of_chunk, None none) {
     return all_chunks(seen, sight, [&](int64_t start, int n) {
@@ -181,8 +181,8 @@ inline bool one_by_one_where_some_fail(const Columns& seen, int64_t sight, Chunk
     });
 }
 
-// The residuals of one sight, project(X) - p of points and the signed distance from pixels to their curves, to the
-// places `rows` (null: in order); NaN, and false, where there is none. s is moved to the foot.
+// Computes the residuals of one sight, project(X) - p for points and the signed distances from pixels to curves, into
+// the rows `rows` of residuals (null: in order); NaN, and false, where there is none. s is moved to the foot.
 template <class Columns>
 inline bool residuals_of(int64_t sight, Projection& shown, const double* pose, const Columns& seen, const int64_t* rows,
                          double* residuals) {
@@ -201,9 +201,9 @@ inline bool residuals_of(int64_t sight, Projection& shown, const double* pose, c
                                       [&](int64_t k) { std::fill_n(place(k), MANY, NO_ANSWER); });
 }
 
-// d residual / d [intrinsics | 6 pose | what moves the observation, BUILT] of one sight into `rows`, RESIDUALS of them
-// for each observation; NaN, and false, where there is none. normals: of curves (M, 2), filled with the image normal at
-// the foot.
+// Computes d residual / d [intrinsics | 6 pose | offsets of the observation, BUILT] of one sight into `rows`, RESIDUALS
+// rows for each observation; NaN, and false, where there is none. normals: for curves (M, 2), filled with the image
+// normal at the foot.
 template <class Columns>
 inline bool rows_of(int64_t sight, Projection& shown, const double* pose, const Columns& seen, double* rows,
                     double* normals) {
