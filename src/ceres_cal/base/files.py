@@ -76,7 +76,7 @@ _MEANING = {  # meanings of fields that may be missing
 
 def most_bytes() -> float:
     """Largest memory for the content of one file: 512 MB, or as CERES_CAL_MOST_MB states."""
-    # enough for 10 million observations in NPZ, one million in JSON, or a grey photograph of 500 megapixels
+    # Enough for 10 million observations in NPZ, one million in JSON, or a grey photograph of 500 megapixels.
     most_mb = 512
     text = os.environ.get(LIMIT, str(most_mb))
     if not text.isdecimal() or int(text) < 1:
@@ -114,7 +114,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[IO[bytes]]:
-    """A file, open for reading.
+    """Open a file for reading.
 
     Raises:
         InputError: it is missing, cannot be read, or is no regular file (reading a pipe or a device may never end).
@@ -354,7 +354,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         InputError: the folder is missing or cannot be written, or the file exists and may not be written.
     """
     try:
-        target = Path(os.path.realpath(path))  # the target of a symbolic link, which is kept
+        target = Path(os.path.realpath(path))  # where a symbolic link points to; the link is kept
         if target.exists() and not target.is_file():
             raise InputError(f"{path}: cannot be written: it is a folder or a device")
         if target.exists() and not os.access(target, os.W_OK):

@@ -194,7 +194,7 @@ def tail_root(above: Callable[[Array, Indices], Array], low: Array, high: Array,
     By Chandrupatla's method (Advances in Engineering Software 28, 1997) on their logarithms: inverse quadratic
     interpolation through three places where that is reliable, else bisection.
     """
-    # least value of the function; tolerance of its logarithm and of the interval, as accurate as its values
+    # Least value of the function; tolerance of its logarithm and of the interval, as accurate as its values; steps.
     least, exact, most_steps = 1e-12, 1e-7, 40
     roots, rows = np.full(len(low), np.nan), np.flatnonzero(np.ones(len(low)))
     x, y, width, share = low, high, exact * (high - low), 0.5 * np.ones_like(low)

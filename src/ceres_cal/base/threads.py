@@ -208,7 +208,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
         except BaseException as error:  # quiet: raised again in the thread that waits
             results.append((None, error))
 
-    # files that it writes are recorded in this context
+    # Files that it writes are recorded in this context.
     thread = _DetachedThread(target=copy_context().run, args=(work,), daemon=True)
     _unfinished.append(thread)
     thread.start()

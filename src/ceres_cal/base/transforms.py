@@ -139,7 +139,7 @@ def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     r = np.asarray(rotation, dtype=float)
     cos_beta = np.hypot(r[0, 0], r[0, 1])
     gamma = np.arctan2(r[0, 1], r[0, 0]) if cos_beta > 1e-15 else 0.0
-    # alpha is computed from the rotation without gamma, so that near beta = +-pi/2 it compensates for gamma's error.
+    # With gamma taken out of the rotation, alpha compensates for gamma's error near beta = +-pi/2.
     s, c = np.sin(gamma), np.cos(gamma)
     alpha = np.arctan2(s * r[2, 0] - c * r[2, 1], c * r[1, 1] - s * r[1, 0])
     return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)

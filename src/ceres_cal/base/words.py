@@ -62,7 +62,7 @@ def fixed(value: float, places: int, sign: str = "") -> str:
 
 
 def powered(text: str) -> str:
-    """Format powers as superscripts: px^-2, or 10^7."""
+    """Format powers with superscript digits, as in px^-2 or 10^7."""
     base, _, power = text.partition("^")
     return base + power.translate(_POWERS)
 
@@ -163,7 +163,7 @@ def ended(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace what is no letter (bytes of a file's name in another encoding) by \\udc.., so that the text can be
+    """Replace bytes that are no letters (a file's name in another encoding) by \\udc.., so that the text can be
     written.
     """
     return text.encode("utf-8", "backslashreplace").decode()

@@ -62,7 +62,7 @@ def make(
         done.append(step)
         if known is None:
             return step.answer().data["found"]
-        # what the command wrote when the lines were found
+        # What the command wrote when the lines were found.
         return write_bytes(step.output, known.observed[step.output.name])
 
     if state.board:
@@ -120,7 +120,7 @@ def field_steps(
         if group[0].name in masked:
             words += ["--mask", str(folder / _mask_name(group[0]))]
         output = folder / (f"field-{number}.json" if number > 1 else "field.json")
-        # otherwise the names of the calibration are used
+        # Otherwise the names of the calibration are used.
         words += [] if sitting.start is not None else ["--camera", CAMERA]
         yield PageStep("detect field", (*map(str, group), *words, "-o", str(output)), output)
 

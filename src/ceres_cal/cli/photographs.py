@@ -131,7 +131,7 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
 def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, base.Image]]:
     each = max(
         1, detect.MOST_PICTURES // (len(videos) + bool(images))
-    )  # of every video, and of the photographs together
+    )  # of each video, and of the photographs together
     for path in images[:: -(-len(images) // each) or 1]:
         yield str(path), detect.read_colour(path)
     for video in videos[: detect.MOST_PICTURES]:

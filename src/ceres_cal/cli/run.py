@@ -219,7 +219,7 @@ def _observed(args: RunArguments, images: list[Path], is_one_of_several: bool) -
         try:
             found = _step(args, "detect board", asked, most=1)
             rest = [path for path in rest if path not in found.data["found"]]
-            # the others may show the field
+            # The other photographs may show the field.
             yield found if args.target is None else replace(found, lines=found.lines[:1])
         except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:

@@ -25,8 +25,8 @@ _WINDOWS = 150  # number of windows from which a blur is estimated
 # depend on direction.
 _SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
 
-# Share of the displacement by coma that may remain after its correction, common to all lines. With 0.4 errors are 0.8
-# of the stated standard deviation, and at most 1.5 of it among 40 pictures.
+# Share of the displacement by coma that may remain after its correction, common to all lines. With 0.4, errors are 0.8
+# times the stated standard deviation, and at most 1.5 times in 40 pictures.
 _OF_COMA = 0.4
 
 
@@ -37,7 +37,7 @@ class Blur(Rows):
         blur_px: (N,) standard deviation of a Gaussian that stands for lens and pixel together.
         smear_px: (N,) length of the additional smear, by camera motion or coma.
         stretch: ratio of the paint's width to the width that the target states.
-        lean: (N,) asymmetry of the smear, from -1 to 1: the end that has more of the light.
+        lean: (N,) asymmetry of the smear, from -1 to 1; its sign gives the end with more light.
     """
 
     blur_px: Array
@@ -57,9 +57,9 @@ class Blur(Rows):
 
     def smeared(self, rows: Indices) -> EdgeShape:
         """Return the shape of these places under the assumption that all blur beyond the lens's own is smear."""
-        # px, the largest blur of a lens in focus: a larger blur in every direction is taken for smear
+        # Largest blur of a lens in focus, px: a larger blur in every direction is taken for smear.
         in_focus_px = 1.0
-        # length of a smear over the standard deviation of the Gaussian that fits the smeared line best
+        # Ratio of the length of a smear to the standard deviation of the Gaussian that fits the smeared line best.
         as_smeared = 2.5
         lens = min(float(np.min(self.blur_px)), in_focus_px)
         here = median(self.blur_px[rows])
@@ -113,9 +113,9 @@ def with_coma(
         fits: fits with a symmetric blur.
         size: height and width of the picture, px.
     """
-    # surely: standard deviations; dark pictures without coma reach 2.6, coma starts at 6.7. outer: share of half the
-    # diagonal. few: number of windows for a first estimate of the smear's length; below least_px coma is not worth
-    # modelling.
+    # `surely`, in standard deviations: dark pictures without coma reach 2.6, coma starts at 6.7. `outer` is a share of
+    # half the diagonal, `few` the number of windows for a first estimate of the smear's length. A smear shorter than
+    # `least_px` is not worth modelling.
     surely, outer, few, least_px = 4.5, 0.2, 50, 1.6
     across, radius = from_middle(course, size)
     rows = _some(np.flatnonzero(np.isfinite(fits.offset_px) & (np.abs(across) > outer)))
@@ -147,7 +147,7 @@ def _sigmas(differences: Array) -> float:
 
 
 def _drawn_out(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, Array]:
-    """Fit a smear of length and direction proportional to `along` (N,); return it and log misfits (R,) of `rows`."""
+    """Fit a smear of length and direction proportional to `along` (N,); return it and the log noise (R,) of `rows`."""
     drawn, _ = _coma_shape(windows, course, blur, rows, along)
     return drawn, np.log(drawn.take(rows).fitted(windows.take(rows), course.take(rows)).noise)
 

@@ -34,7 +34,7 @@ _HINTS = {
 # (width + height)^2 / _LONG counts as the number of pixels of a long image. That exceeds width x height only from sides
 # of 1 : 14 on, longer than any camera's picture.
 _LONG = 16
-_LEAST_SIDE_PX = 8  # px, the shorter side of an image to search: three squares of less than 3 px show no corner
+_LEAST_SIDE_PX = 8  # least side of an image that is searched, px: three squares of less than 3 px show no corner
 _ADAPTIVE = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 # Number of pixels, and smallest scale, at which a board is searched first. On 62 real boards this finds as many as full
 # size does, in a fifth of the time. A smaller scale would not locate corners to a few pixels. Saving less than half of
@@ -44,7 +44,8 @@ _LARGE_PX = 2e6  # pixels; larger images are searched at this size first, which 
 _MOST_PX = 1.6e7  # pixels, the largest size searched: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SAMPLED = 4  # every 4th row and column is used to measure the range of a picture's brightness
 _SUBPIX_HALF_WINDOW_PX = 5  # upper limit; a third of the spacing keeps neighbouring corners out of the window
-# log of the ratio of successive steps (1.57 times): a skipped square makes 2, perspective on three squares hardly 1.3
+# Limit of the absolute log ratio of successive steps (a factor of 1.57): a skipped square gives 2, perspective on three
+# squares hardly 1.3.
 _UNEVEN = 0.45
 _SMALL_PX = 2e6  # pixels; smaller images are searched at twice their size, too: their squares may be few pixels wide
 
@@ -81,8 +82,9 @@ def detect_boards(
     dark. Otherwise x points to the right of the picture rather than to the left. A board that is turned by a right
     angle may get the other name; its placement absorbs that, but the shape of a bent board does not.
 
-    `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. A board that
-    is not flat and an unmodelled lens add up to ten times that in real sets, which only the solve can determine.
+    `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. In real sets,
+    a board that is not flat and an unmodelled lens cause errors of up to ten times that, which only the solve can
+    determine.
 
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
@@ -92,10 +94,10 @@ def detect_boards(
         camera: name of the camera.
         station: name of the station; by default that of the camera.
         corner_fit: one of CORNER_FITS, for a checkerboard. "saddle" fits a blurred saddle to each corner, as is always
-            done for other boards. It is about four times more precise on rendered boards (0.005 px against 0.02), has
-            no shift towards the middle of a window as cornerSubPix has, and measures boards that reach out of the
-            picture, if it shows which corners are seen. "opencv" measures with cornerSubPix, as other calibrators do,
-            so that results compare; boards must be seen whole.
+            done for other boards. It is about four times more precise on rendered boards (0.005 px against 0.02), and
+            has no shift towards the middle of a window as cornerSubPix has. Boards may reach out of the picture, if it
+            shows which corners are seen. "opencv" measures with cornerSubPix, as other calibrators do, so that results
+            can be compared; boards must be seen whole.
         progress: called after each image.
 
     Raises:
@@ -290,7 +292,7 @@ def _found_fast(image: Image8, columns: int, rows: int) -> Array | None:
     # takes seconds.
     flags = _ADAPTIVE | (cv2.CALIB_CB_FAST_CHECK if scaled.size > 2.0 * _FAST_PX else 0)
     shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=flags)
-    if not shown and scaled.size < image.size <= _LARGE_PX:  # takes a tenth of the time of the thorough search
+    if not shown and scaled.size < image.size <= _LARGE_PX:  # this takes a tenth of the time of the thorough search
         scaled = image
         shown, corners = cv2.findChessboardCorners(image, (columns, rows), flags=_ADAPTIVE | cv2.CALIB_CB_FAST_CHECK)
     return _places_in(image, scaled, corners).reshape(rows, columns, 2) if shown else None
@@ -401,7 +403,8 @@ def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
 
 
 def _points(grids: Sequence[Array], board: Target) -> Points:
-    features = np.arange(len(board.points), dtype=np.int32).reshape(grids[0].shape[:2])  # as targets list them
+    # in the order of the target's points
+    features = np.arange(len(board.points), dtype=np.int32).reshape(grids[0].shape[:2])
     seen = [~np.isnan(grid[..., 0]) for grid in grids]
     count = [int(np.count_nonzero(s)) for s in seen]
     return Points(

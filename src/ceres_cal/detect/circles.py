@@ -18,7 +18,7 @@ def measured_circles(image: Image8, board: Target) -> Array | str:
     """Return the centres (rows, columns, 2) px, or the reason why there are none."""
     columns, rows, asymmetric = (board.spec[name] for name in ("columns", "rows", "asymmetric"))
     layout = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    # the second way also finds tilted boards, and boards in clutter
+    # The second way also finds tilted boards, and boards in clutter.
     for how in (layout, layout | cv2.CALIB_CB_CLUSTERING):
         shown, seen = cv2.findCirclesGrid(image, (columns, rows), flags=how)
         if shown:

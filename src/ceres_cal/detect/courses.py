@@ -14,9 +14,9 @@ class Course(Rows):
     """N places on painted curves as the camera should see them, curve by curve and in order along each.
 
     Attributes:
-        curve: (N,) index among the target's curves. s: (N,) the curves' parameter.
-        pixels: (N, 2) px. normals: (N, 2) of length 1, towards the curve's left. curvature: (N,) 1/px, positive towards
-            the normal. width_px: (N,) width of the paint along the normal.
+        curve: (N,) index among the target's curves. s: (N,) parameter on the curve.
+        pixels: (N, 2) places in the image, px. normals: (N, 2) of length 1, towards the curve's left. curvature: (N,)
+            1/px, positive towards the normal. width_px: (N,) width of the paint along the normal.
     """
 
     curve: Indices32
@@ -45,7 +45,8 @@ def predict(
     painted = [i for i, (name, curve) in enumerate(target.curves.items()) if name in curves and curve.width_m > 0.0]
     number, s = _places(target, camera, np.array(painted, dtype=np.int32), spacing_px, margin_px)
     course = course_at(target, camera, number, s)
-    # Where the lens folds over, only one edge of the paint may be visible. The search is not made for wider paint.
+    # Where the lens folds over, only one edge of the paint may be visible. The search is not made for paint wider than
+    # `widest_px`.
     whole = np.isfinite(course.curvature + dots(course.pixels, course.normals))
     return course.take(whole & (course.width_px < widest_px))
 

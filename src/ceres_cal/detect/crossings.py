@@ -54,9 +54,9 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points
 
 
 def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:
-    # how far a branch is followed, and the standard deviation of its bend at that distance
+    # How far a branch is followed, and the prior standard deviation of its bend at that distance.
     reach_px, bent_px = 100.0, 0.5
-    # number of places: on each side of a branch that goes on, of one that ends, and the least
+    # Number of places: on each side of a branch that continues, of a branch that ends, and the least number.
     each_way, one_way, fewest = 3, 8, 3
     course = lines.course
     foot = nearest_on_curve(target.curves[target.curve_names[curve]], point[None])

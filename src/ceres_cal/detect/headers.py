@@ -9,7 +9,7 @@ _COMMENT = rb"(?:\s+|#[^\n]*\n)+"
 _PNM = re.compile(rb"P[1-6]" + _COMMENT + rb"(\d{1,9})" + _COMMENT + rb"(\d{1,9})")
 _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of frame headers; the excluded ones are tables
 _ORDERS = {b"II*\0": "<", b"MM\0*": ">"}  # byte order of a TIFF, by its first bytes
-# the tag, and the clockwise turn by which viewers show each of its values
+# Number of the tag, and the clockwise turn, in degrees, by which viewers show each of its values.
 _ORIENTATION, _TURNED_DEG = 274, {3: 180, 6: 90, 8: 270}
 _EXIF = b"Exif\0\0"  # precedes the TIFF that holds a JPEG's metadata
 

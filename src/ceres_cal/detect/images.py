@@ -26,7 +26,7 @@ from ceres_cal.detect.headers import claimed_size
 _BYTES_PER_PIXEL = 3
 # Shares of a colour sensor's pixels that see blue, green and red.
 _OF_MOSAIC = np.array([0.25, 0.5, 0.25], np.float32)
-# weights of human vision: luma of ITU-R BT.601, in JPEG files and videos
+# Weights of human vision: luma of ITU-R BT.601, in JPEG files and videos.
 _AS_SEEN = np.array([0.114, 0.587, 0.299], np.float32)
 _AROUND_PX = (301, 101, 31)  # widths of the windows over which masked pixels are filled, ever nearer
 _LEAST_PX = 16  # least width and height: the windows around a corner or across a line are wider
@@ -73,7 +73,7 @@ def light(image: Image) -> Array32:
 
 def _is_colour_coarse(blue: Array32, seen: Array32) -> bool:
     """Whether the colours of an image (blue minus luma) lack the detail that its luma has."""
-    # limit of the ratio: 0.03 to 0.13 for JPEG files, else 0.34 or more
+    # Limit of the ratio of colour detail to luma detail: 0.03 to 0.13 for JPEG files, 0.34 or more otherwise.
     kernel, coarse = np.array([1.0, -2.0, 1.0], np.float32), 0.2
     every = 4  # one row of so many is examined
     fine, colour = (np.abs(cv2.sepFilter2D(one, -1, kernel, kernel)[::every]) for one in (seen, blue - seen))
@@ -105,7 +105,7 @@ def _decoded(path: str | Path, channels: int) -> Image:
 
 
 def _not_an_image(content: bytes) -> str:
-    """What is wrong with a file that is no image, and what to do."""
+    """Return what is wrong with a file that is no image, and what to do."""
     if not content:
         return "not an image but an empty file: leave it out"
     with suppress(UnicodeDecodeError):  # reads: "not an image that OpenCV can read ..."
@@ -151,7 +151,7 @@ def filled(grey: Array32, left_out: Mask) -> Array32:
 
 
 def negative(grey: Array32) -> Array32:
-    """The negative of a photograph: lines that are darker than the floor are lighter in it."""
+    """Return the negative of a photograph, in which lines darker than the floor become lighter than it."""
     return np.asarray(np.max(grey) - grey, dtype=np.float32)
 
 

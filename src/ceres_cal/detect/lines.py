@@ -49,8 +49,8 @@ _FAR, _FAR_PX = 5.0, 0.25
 # Largest distance from the neighbours, in units of their own spread. Half of it loses 0.2 % of the line centres, double
 # adds 0.2 %.
 _WANDERING = 4.0
-# Step between the places of which the scatter is measured: on a nearly level line errors depend on its position in the
-# pixel, so they are alike over shorter distances. And the candidates for additional scatter, px.
+# Step between the places whose scatter is measured: on a nearly horizontal line errors depend on its position within
+# the pixel, and are alike over shorter distances. And the candidates for additional scatter, px.
 _APART = 3
 _SCATTER_PX = np.concatenate([[0.0], np.geomspace(0.002, 1.0, 60)])
 

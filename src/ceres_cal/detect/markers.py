@@ -74,8 +74,8 @@ def measured_markers(image: Image, levels: Image8, target: Target, finder: cv2.a
 
 
 def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
-    """(4, 3) offset of each side to the outside of the quad's, px, as a polynomial of the place along it from -1 to 1;
-    None where a side is not seen, or the cells are too small.
+    """(4, 3) offset of each measured side outwards from the quad's side, px, as a polynomial of the place along it from
+    -1 to 1; None where a side is not seen, or the cells are too small.
     """
     cell = 0.5  # half length of a window, as a share of a cell: the marker's border is one or two cells wide
     least_half_length_px = 1.5  # least half length of a window; with smaller cells sides cannot be measured

@@ -23,7 +23,8 @@ _MOVED_PX = 0.2
 _BLURRED = 0.5
 _BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # blocks to a side; pixels used of each; fewest pixels of a block that counts
 _CLEAR = 4.0  # limit of a clear gradient, in units of the median gradient, which is noise and texture
-# iterations of the fit, and of the choice of pictures; deviation (sigma) beyond which a level is down-weighted
+# Iterations of the fit, and of the choice of pictures; deviation, in standard deviations, beyond which a level is
+# down-weighted.
 _ROUNDS, _BEND = 8, 2.0
 _BAND, _EVERY = 64, 31  # rows processed at once; step between the pixels from which noise is estimated
 _NEAR = 3.0  # largest deviation from the median, in standard deviations of the noise
@@ -186,6 +187,6 @@ def _middle(greys: Sequence[Image]) -> Array32:
         near = np.abs(band - median) <= max(_NEAR * noise, 1.0)
         count = np.count_nonzero(near, axis=0)
         mean = np.sum(band, axis=0, where=near) / np.maximum(count, 1)
-        # two levels that differ have none near their median
+        # Two pictures whose levels differ have no level near the median.
         picture[row : row + _BAND] = np.where(count > 0, mean, median)
     return picture

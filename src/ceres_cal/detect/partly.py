@@ -26,7 +26,7 @@ _CLEAR = 0.2  # share of the corners' spacing, from the border: a predicted corn
 # the outermost lines have 0.79 or more, with blur of 5 px or noise of 12 grey levels 0.66; lines beyond the board's end
 # have 0.57 at most, with blur or noise 0.56.
 _ENDED = 0.7
-# offsets from a corner, in squares: a corner is predicted to a tenth of a square
+# Offsets from a corner, in squares: a corner is predicted to a tenth of a square.
 _QUARTERS = np.array([-0.35, -0.2, 0.2, 0.35])
 NO_PLACE = "no place on it"
 
@@ -124,7 +124,7 @@ def _trimmed(saddles: Saddles) -> Saddles:
 
 
 def _foreseen(grid: Array) -> Array:
-    """The grid, and unknown corners where the three, or two, before them on any line lead to, in the mean."""
+    """Extrapolate unknown corners from the two or three corners before them on each line; the mean over the lines."""
     lines = [[_shifted(grid, axis, step * k) for k in (1, 2, 3)] for axis in (0, 1) for step in (1, -1)]
     bent = np.array([3.0 * first - 3.0 * second + third for first, second, third in lines])
     straight = np.array([2.0 * first - second for first, second, _ in lines])
@@ -134,7 +134,7 @@ def _foreseen(grid: Array) -> Array:
 
 
 def _shifted(values: Array, axis: int, by: int) -> Array:
-    """The values of the neighbours `by` places before; NaN beyond the ends."""
+    """Shift values along an axis by `by` places; NaN beyond the ends."""
     moved = np.full_like(values, np.nan)
     to, of = (slice(by, None), slice(-by)) if by > 0 else (slice(by), slice(-by, None))
     moved.swapaxes(0, axis)[to] = values.swapaxes(0, axis)[of]

@@ -26,7 +26,7 @@ _STEP_PX = 0.5
 # Least share of the rays that show a ring (among those that reach it inside the image). Nothing changes from half to
 # double.
 _FEWEST_RAYS = 0.25
-_HARMONICS = 3  # of a ring's radius as a function of its angle, for tilt and a centre beside the optical axis
+_HARMONICS = 3  # harmonics of a ring's radius as a function of its angle, for tilt and a centre beside the optical axis
 _HALF_LENGTH_PX, _HALF_WIDTH_PX = 5.0, 2
 # Least contrast of an edge, in units of the noise. Nothing changes from half to double.
 _LEAST_CONTRAST = 8.0

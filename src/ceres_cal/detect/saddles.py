@@ -41,13 +41,13 @@ _RADIUS_PX = (3.0, 20.0)
 # something else. Nothing changes from 0.33 to 0.67.
 _LOST = 0.5
 _ROUGH = 0.6  # radius of the disc in the first fit, as a share of the reach
-_WHOLE = 32.0  # px, step of a cut-out's first pixel: no picture is shrunk by so much
+_WHOLE = 32.0  # px; a cut-out begins at a multiple of this, and no picture is shrunk by as much
 # Least contrast, as a share of the usual one: a lower one shows something else, a sticker or a finger. Nothing changes
 # from half to double.
 _FAINT = 0.2
-# least contrast, as a share of the brightest pixel: in a picture of one grey every contrast is rounding
+# Least contrast, as a share of the brightest pixel: in a picture of one grey every contrast is rounding.
 _ROUNDING = 1e-6
-# product of sharpness and standard deviation of a Gaussian blur for which tanh has the slope of the blurred edge
+# Sharpness times standard deviation of a Gaussian blur, for which tanh has the slope of the blurred edge.
 _BLUR = 0.8
 
 # Columns of the kernel's fitted parameters.

@@ -45,7 +45,7 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
     # Prior standard deviation of the displacement's amplitude, smaller for wide lines: their edges are displaced alike.
     prior_px = 0.1 / max(median(course.width_px), 1.0)
     bends = offset_px[threes] @ _CURVATURE
-    # the position of a line within its pixel follows from its measured place without the displacement
+    # The position of a line within its pixel is its measured place without the displacement.
     for _ in range(_ROUNDS):
         turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
         amplitude, sigma = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends, prior_px)

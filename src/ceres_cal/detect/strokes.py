@@ -214,7 +214,7 @@ def _strokes(pixels: Array, strength: Array, piece: Indices) -> Strokes:
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     along_x, along_y = np.cos(angle), np.sin(angle)
     root = np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
-    # half length of a uniform line with that second moment
+    # Half length of a uniform line with that second moment.
     half = np.sqrt(3.0 * np.maximum(0.5 * (xx + yy) + root, 0.0))
     across = np.sqrt(np.maximum(0.5 * (xx + yy) - root, 0.0))
     good = (2.0 * half >= _LEAST_PX) & (across < _STRAIGHT_PX) & (count > 2.0 * _DENSE * half)

@@ -25,7 +25,7 @@ _MODELS = {
     FISHEYE: "OPENCV_FISHEYE",
     THIN_PRISM_FISHEYE: THIN_PRISM_FISHEYE,
 }
-# number of coefficients after fx fy cx cy; the other models have four
+# Number of coefficients after fx fy cx cy; the other models have four.
 _COUNTS = {"FULL_OPENCV": 8, THIN_PRISM_FISHEYE: 8}
 _HALF = 0.5
 
@@ -110,7 +110,7 @@ def _read(request: ImportRequest) -> Any:
     if not cameras:
         raise InputError("none of its images has a pose")
     stems = {_stem(name): camera for name, camera in cameras.items()}
-    # otherwise images in different folders have the same name: whole names distinguish them
+    # Otherwise images in different folders have the same name: whole names distinguish them.
     if len(stems) == len(cameras):
         cameras = stems
     warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")

@@ -115,7 +115,7 @@ def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
             receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            # otherwise packets of groups that other programs joined on other network cards arrive, too
+            # Otherwise packets of groups that other programs joined on other network cards arrive, too.
             if sys.platform == "linux":
                 receiver.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
             receiver.bind((group.address, group.port))

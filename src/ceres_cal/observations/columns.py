@@ -113,7 +113,7 @@ class Columns(Rows):
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
-            # stays in its file, or is suitable already
+            # The column stays in its file, or is suitable already.
             if isinstance(values, np.memmap) or _is_kept(values, TYPES[name]):
                 continue
             column = np.array(values, dtype=TYPES[name], order="C")  # the compiled kernels require this order

@@ -202,7 +202,7 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     # Their effect on places is included in the maps, that on the picture in its radius.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
-    # these begin with names, which are not capitalised
+    # These lines begin with names, which are not capitalised.
     yield from ((level, f"{words}.") for words in weak[:most_lines])
     if len(weak) > most_lines:
         yield level, f"{len(weak) - most_lines} more such directions: see the numbers."

@@ -259,7 +259,7 @@ def _angle_sds(rotation: Array, covariance: Array, sd: Array) -> Array:
         [(_angles_deg(rotation_exp(turn * axis) @ rotation) - _angles_deg(rotation)) / turn for axis in np.eye(3)], 1
     )
     slopes = (slopes + 180.0 / turn) % (360.0 / turn) - 180.0 / turn  # a turn past 180 degrees is a small one
-    # unknown turns give NaN; an angle that does not depend on one counts as unknown, too
+    # Unknown turns give NaN; an angle that does not depend on one counts as unknown, too.
     with np.errstate(invalid="ignore"):
         spread = np.stack([np.einsum("ai,ij,aj->a", slopes * s, correlation, slopes * s) for s in sd.T], 1)
     return np.where(np.isfinite(spread), np.sqrt(np.maximum(spread, 0.0)), np.inf)

@@ -219,7 +219,7 @@ def _region_table(summary: Summary, camera: str) -> Table:
 
 def against_radius(material: Material, name: str) -> Figure:
     """Make the figure of residuals away from the principal point against the radius, with their trend."""
-    # limit of the sd of a ring's mean, as a share of the residuals' range; less certain means are only in the table
+    # Limit of the sd of a ring's mean, as a share of the residuals' range; less certain means are only in the table.
     vague = 0.3
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     trend = next(trend for trend in material.diagnosis.summaries.trends if trend.camera == name)

@@ -28,13 +28,13 @@ from ceres_cal.scene.targets.target import PAINT_WANDERS
 _SCATTER, _FARTHEST = PAINT_WANDERS * 0.5 ** np.arange(4.0, -0.5, -0.5), 3.0
 _OTHER = 0.1  # prior standard deviation of a dimension that differs, as a share of the dimension
 _LOG_ODDS = np.log(0.1 / 0.9)  # prior log odds that a curve is misplaced, or that a dimension differs
-# Beam search: sets that are extended, largest number of parts, and how many parts more are tried without improvement.
-# Of 46 pictures one needed the third, where misplaced lines hide one another.
+# Beam search: number of sets that are extended, largest number of parts of a set, and number of further parts without
+# improvement after which the search ends. Of 46 pictures one needed the third, where misplaced lines hide one another.
 _BEAM, _MOST, _IN_VAIN = 24, 9, 3
 # Least change of a dimension that makes another field: as a share of it, and in units of the usual offset of a
 # misplaced curve. A tape measure, an unusual lens and a floor that is not flat cause smaller changes.
 _OTHER_FIELD, _LONGER = 0.02, 4.0
-# least change of a dimension in standard deviations, which assume that lines are taped independently of each other
+# Least change of a dimension in its standard deviations, which assume that lines are taped independently of each other.
 _SURELY = 10.0
 _APART, _ALIKE = 40, 0.1  # largest distance, in places, and least correlation at which errors count as correlated
 
@@ -46,12 +46,11 @@ class FieldAsBuilt(Frozen):
         aside_m: name of a misplaced curve -> its offset from its drawing, m.
         dimensions: name of a dimension that differs from the target's -> its most likely value, m.
         sd_m: name of each of those curves and dimensions -> its standard deviation, m.
-        drawn: name of a dimension -> its value in the target, m.
-        names: of the curves used.
+        drawn: name of a dimension -> its value in the target, m. names: of the curves used.
         usual_m: usual offset of a misplaced curve, m. scatter_m: standard deviation of the other curves' offsets, m; 0
             where none is seen.
-        wander_m: unevenness of the lines, m, that none of this nor the stated sigmas explain; infinite where the camera
-            shows no line.
+        wander_m: standard deviation of the lines' deviations, m, that none of this nor the stated sigmas explain;
+            infinite where the camera shows no line.
     """
 
     aside_m: Mapping[str, float]
@@ -133,7 +132,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
     problem, estimate = problem_of(camera, seen, free, priors)
     left = residuals(problem.sights, estimate)
-    # reads: "..." of `AsBuilt.words`: this is another field
+    # reads: "..." of `FieldAsBuilt.words`: this is another field
     equations = attempt(lambda: write_equations(problem.sights, estimate, left), SolutionError)
     if isinstance(equations, CalibrationError):
         return replace(AS_DRAWN, wander_m=np.inf)
@@ -144,7 +143,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     columns = equations.structure_columns(structure)
     there = np.flatnonzero(np.any(columns != 0.0, axis=0))
     normal, slope = model.left_of(columns[:, there])
-    # residuals of lines that no offset straightens: wavy tape, another lens
+    # Residuals of lines that no offset straightens show wavy tape, or another lens.
     bent = model.with_columns(columns[:, there])
     misfit = float(bent.left_over @ bent.left_over) / max(bent.spare, 1)
     noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / together)
@@ -159,7 +158,7 @@ def _wander_m(lines: Lines, target: Target, left_px: Array, places: Indices) -> 
     """Standard deviation, m, of the paint's deviation from the drawing, from the residuals of the places that were
     found; 0 up to twice the stated sigma, which a calibration estimates as noise.
     """
-    # median of the absolute value of a normal variable of standard deviation 1
+    # Median of the absolute value of a normal variable, in its standard deviations.
     found, usual = lines.take(lines.found).take(places), 0.6745
     times = median(np.abs(left_px) / found.sigma_px) / usual
     wide_m = np.array([target.curves[name].width_m for name in target.curve_names])

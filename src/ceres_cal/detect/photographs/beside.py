@@ -31,10 +31,10 @@ _PaintLine = tuple[Indices, Array]
 def among_others(
     grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics
 ) -> tuple[Camera, Target] | None:
-    """Return the camera and target for which some curves are other lines than the nearest; None where the nearest fit
+    """Return the camera and target for which some curves are other lines than the nearest; None if the nearest fit
     best.
     """
-    sigma_px = 0.5  # of a peak's position
+    sigma_px = 0.5  # standard deviation of a peak's position
     spacing_px = 12.0
     course = predict(target, camera, curves, spacing_px, 2.0)
     best, least = None, np.inf

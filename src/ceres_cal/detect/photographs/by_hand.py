@@ -80,7 +80,7 @@ def starts_from_clicks(
     Raises:
         InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
-    # radial stretch of the image's corner by the lens; the last is a fisheye's
+    # Radial stretch of the image's corner by the lens; the last one is a fisheye's.
     stretches = (1.0, 1.06, 1.14, 1.25, 1.4, 1.7, 2.3, 4.0)
     clicks.require_names(target)
     points = {name: (*pixel, SIGMA_PX) for name, pixel in clicks.points.items()}
@@ -226,7 +226,7 @@ def judged(shown: PointHints, camera: Camera, base: Camera) -> tuple[Camera, dic
     """
     enough = 10  # least number of equations with which a contradiction can be seen
     off_px, sigma_px = off(shown, camera)
-    # the other clicks absorb a share of an error
+    # The other clicks absorb a share of an error, hence half of the limit.
     if shown.equations < enough or np.all(off_px <= 0.5 * _AGAINST * sigma_px):
         return camera, {}
     robust = _fitted(shown, camera, _turned(shown, base), ROBUST) or camera

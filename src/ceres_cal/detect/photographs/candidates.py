@@ -31,14 +31,14 @@ _COMPARABLE, _ALIKE = 0.3, 0.9
 # 0.38 at most.
 _LIKELY = 0.5
 _MOST, _MOST_ALIKE = 4, 60
-# Share of an unknown length by which it is drawn longer and shorter, too: a match is nearly as good up to half of it
-# away.
+# Step, as a share of an unknown length, by which it is drawn longer and shorter, too: a match is nearly as good up to
+# half a step away.
 _LENGTH_STEP = 0.06
 BUDGET_S = 60.0
 """Processor time for one photograph, s: ten times what one takes that shows the field (6 s on two cores). Without it
 the search for another field, whose lines fit in ever more places, took more than 200 s.
 """
-_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in camera heights; in rad
+_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # limits within which two cameras are the same, in camera heights and rad
 
 
 class Auto(Frozen, eq=True):
@@ -110,7 +110,7 @@ def off_centre(search: FieldSearch) -> FieldSearch:
     """Return the search with the lens centred in that quarter of the picture about which strokes are clearly straighter
     than about its middle, as in a picture that is a part of a sensor; unchanged if there is none.
     """
-    # distance of the centres from the middle, as a share of the picture; least gain in score
+    # Distance of the centres from the middle, as a share of the picture; least gain in score.
     share, better = 0.22, 0.05
     middle, size = search.stroke_map, np.array(search.stroke_map.image_size)
     maps = [middle, *(replace(middle, centre=size * one) for one in product((0.5 - share, 0.5 + share), repeat=2))]
@@ -193,7 +193,7 @@ def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> 
     """Return, the best first, the cameras whose predicted lines are seen in the picture about as well as the best
     one's, and the first camera of those given.
     """
-    # the caller reports that time ran out
+    # After the time limit the rest is left out, which the caller reports.
     in_time = ((grid.target, camera) for camera, grid in cameras if not search.is_out_of_time)
     likelihood = likelihoods_of_places(search.grey, in_time, search.grid.curves)
     order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST].tolist()
@@ -208,7 +208,7 @@ def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> 
 
 def _optics(upright: Upright, stroke_map: StrokeMap) -> Camera:
     """Return a camera with the polynomial that is nearest to the one coefficient, over the image."""
-    share = np.linspace(0.0, 1.02, 60)  # in units of half the image's diagonal
+    share = np.linspace(0.0, 1.02, 60)  # radius in units of half the image's diagonal
     ideal = share / (1.0 + upright.bend * share**2)
     values = np.linalg.lstsq(share[:, None] ** np.array(_POWERS), ideal - share, rcond=None)[0]
     lens = Radial(tuple(values / stroke_map.unit_px ** (np.array(_POWERS) - 1.0)), _POWERS)
@@ -233,8 +233,8 @@ def _upright_of(camera: Camera, search: FieldSearch) -> Upright:
 def _distinct(
     scored: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
 ) -> list[Camera]:
-    """Return the best of the cameras that place the target differently, whatever its turn, and not as `known` does;
-    best first.
+    """Return, the best first, the best of the cameras that place the target differently, whatever its turn, and not as
+    `known` does.
     """
     given = [] if known is None else [known]
     cameras = [*given, *(camera for score, camera in scored if score >= least * scored[0][0])]

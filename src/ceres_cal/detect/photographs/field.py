@@ -252,7 +252,7 @@ def _found(prior: Prior, followed: FieldLines) -> Prior:
 
 
 def _tracked(lengths: tuple[Prior, ...]) -> tuple[Prior, ...]:
-    """Return the priors as tight as lines are followed under: a field is about as large as stated."""
+    """Limit the sigmas of the priors for following lines: a field is about as large as stated."""
     return tuple(replace(one, sigma=(min(one.sigma[0], _ABOUT * one.value[0]),)) for one in lengths)
 
 

@@ -34,14 +34,15 @@ from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, target_from_spec
 
-FAR_PX = 130.0  # how far off the start may be, px
+FAR_PX = 130.0  # largest error of a start, px
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # Reaches for a start from points that a user showed: a line farther off than these points' errors cannot attract it.
 _SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
-# For a picture that was not stretched: least ratio of the shares of paint found with square and with free pixels, and
-# largest ratio of the misfits, 1.3 there and 9 where the picture was stretched by 2 to 7 %.
+# Limits within which square pixels suit a picture: least ratio of the share of paint found with them to that with free
+# pixels, and largest ratio of the misfits. The latter is 1.3 for pictures that were not stretched, and 9 for pictures
+# stretched by 2 to 7 %.
 _KEPT, _WORSE = 0.95, 2.0
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
@@ -51,7 +52,7 @@ _ROUNDS = 6
 _NEARER = 2  # how often lines of changed dimensions are searched again
 _LESS = 0.02  # a share of paint lower by at most this is no worse
 _AT_REST_PX = 0.1  # lines whose prediction moves by less are not measured again: they are found up to 5 px off
-# cameras closer than this converge to the same result: wrong ones moved by 0.8 px at most, to that result
+# Cameras closer than this converge to the same result: wrong ones moved by 0.8 px at most, to that result.
 _SAME_PX = 1.0
 
 _T = TypeVar("_T")
@@ -124,7 +125,7 @@ class Tracker:
         """
         tracker = self.lacking(lacking).of_painted(camera)
         lines = tracker.measured(camera)
-        # whether the picture has coma does not depend on where its lines are now
+        # Whether the picture has coma does not depend on where its lines are now.
         tracker = replace(tracker, is_even=lines.is_even)
         return tracker.told(tracker.followed(camera, lines))
 
@@ -233,7 +234,7 @@ class Tracker:
         return came
 
     def _at_rest(self, camera: Camera, names: tuple[str, ...]) -> FieldLines:
-        # a step must be smaller than this share of the last one: lines that alternate, or do not fit, never converge
+        # A step must be smaller than this share of the last one: lines that alternate, or do not fit, never converge.
         no_nearer = 0.8
         tracker, lines, moved, there = self, self.measured(camera), np.inf, camera
         for _ in range(_ROUNDS):
@@ -253,7 +254,7 @@ class Tracker:
         """Refine the result: predict with the lens that fits the curves best, without the misplaced curves."""
         whole = self._with(followed)
         followed = whole.without_aside(followed)
-        # possibly because of an unsuitable lens: a polynomial bends the lines of a strong one
+        # Possibly because of an unsuitable lens: a polynomial bends the lines of a strong one.
         if followed.built.is_other:
             other = whole.without_aside(whole.farther(whole.with_best_lens(followed)))
             other = self.as_drawn(other) if other.built.is_other else other
@@ -309,7 +310,7 @@ class Tracker:
         return even if not stretched.is_field or (is_told and not self._suits_worse(nearest, stretched)) else stretched
 
     def _suits_worse(self, one: FieldLines, other: FieldLines) -> bool:
-        """Whether less paint is found at the first result's lines than at the second's, or fits them worse."""
+        """Whether less paint is found at the first result's lines than at the second's, or the first fits it worse."""
         return one.share < _KEPT * other.share or self._misfit(one) > _WORSE * self._misfit(other)
 
     def _misfit(self, followed: FieldLines) -> float:

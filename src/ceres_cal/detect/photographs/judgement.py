@@ -16,12 +16,12 @@ from ceres_cal.scene import Arc, Target
 # Largest distance of a stroke that lies on the target, px: the edge of wide paint is that far from its middle. Nothing
 # changes from half to double.
 _NEAR_PX = 6.0
-# Least share of the strokes that could be lines of the target which lie on it. On photographs with cables, seams and
+# Least share of strokes on the target, among those that could be its lines. On photographs with cables, seams and
 # stripes of sun it is 0.83 or more, for other fields 0.6 at most.
 _EXPLAINED = 0.75
-# Least share of all strokes, including those beside the target, where walls and boundary lines run. It is 0.61 or more
-# where the target is seen whole. The lower limit holds if all of the target's lines are there, because a wider boundary
-# line may show more strokes than they do.
+# Least share of strokes on the target among all strokes, including those beside it, where walls and boundary lines run:
+# first if some of the target's lines are absent, then if all are there. The share is 0.61 or more where the target is
+# seen whole, and less where a wider boundary line shows more strokes than the target's lines do.
 _OF_ALL, _OF_ALL_IF_WHOLE = 0.55, 0.4
 # _LAID: number of straight lines that a camera can place on any others by position, size and bend. The other limits are
 # of the negative log of the chance that the remaining lines lie on strokes by coincidence. From _NO_CHANCE on,

@@ -31,7 +31,7 @@ _PAIRS = 120
 _FEW, _MANY = 60, 300  # number of places on the target at which all hypotheses, and the best ones, are scored
 # Least share of the places on the target that are in view: a camera that shows less is too near.
 _LEAST_IN_VIEW = 0.03
-CROWDED = 0.12  # distance, in half diagonals, within which lines of a target are hardly ever parallel
+CROWDED = 0.12  # distance in half diagonals, within which a target hardly ever has parallel lines
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
 

@@ -220,7 +220,7 @@ def _one_way(problem: FieldSearch, distinct: Sequence[FieldLines]) -> SearchResu
     agreeing = _consistent(problem, ways)
     number = agreeing[0] if agreeing else 0
     camera, one = ways[number], distinct[number // len(problem.grid.turns)]
-    is_refined = one.built.names and number % len(problem.grid.turns) == 0  # and not turned
+    is_refined = one.built.names and number % len(problem.grid.turns) == 0  # only the unturned view was refined
     followed = one if is_refined else _tracker(problem, one.target, camera).refined_from(camera, one.lacks_wholly)
     if against := objection(problem, followed):
         return SearchResult(None, against, seen=followed)

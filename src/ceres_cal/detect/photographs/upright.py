@@ -29,7 +29,7 @@ _USUAL_TILT = 0.5
 # Penalty at one standard deviation, as a share of all strokes: it decides only where strokes do not. Nothing changes
 # from half to double.
 _PRIOR_WEIGHT = 0.03
-# tilt, degrees, and number of its directions
+# Tilt in degrees, and number of directions of the tilt.
 _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off, in the first and the last round
@@ -177,6 +177,6 @@ def _deviation(bend: Array, phi: Array, rotation: Array, ends: Array) -> tuple[A
 
 
 def _apart(one: Upright, other: Upright) -> bool:
-    """Whether two solutions differ by more than quarter turns."""
+    """Whether two solutions are distinct, apart from quarter turns."""
     away = np.linalg.norm(one.rotation[:, 2] - other.rotation[:, 2])
     return bool(away > _APART or abs(one.bend - other.bend) > 0.05 or abs(np.log(one.phi / other.phi)) > 0.15)

@@ -23,7 +23,7 @@ from ceres_cal.scene import Camera, Target, along_track, curve_points, in_image
 Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""
 COLOURS: dict[str, Colour] = {
-    # cyan: colour-blind readers can distinguish it from magenta, and neither occurs in paint or carpet
+    # Cyan: colour-blind readers can distinguish it from magenta, and neither occurs in paint or carpet.
     "before": (255, 190, 0),
     "after": (200, 0, 255),
     "lifted": (0, 220, 255),
