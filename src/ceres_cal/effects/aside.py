@@ -209,7 +209,7 @@ def _features(observations: Observations, owner: Indices, frames: Indices) -> Fe
 
 
 class Offsets(Frozen):
-    """What residuals say of the offsets of G groups.
+    """The information of residuals on the offsets of G groups.
 
     Attributes:
         effects: the modes of the groups as random effects. modes: (G, R, M) the effect of an offset of each group on
@@ -264,7 +264,7 @@ class Offsets(Frozen):
 
 
 def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) -> Offsets:
-    """What a model's residuals say of the offsets of groups.
+    """Measure the offsets of groups from a model's residuals.
 
     Args:
         effect: its columns, here in standard deviations of an equation, of order one. prior: that a group is wrong, and

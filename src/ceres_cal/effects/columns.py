@@ -419,7 +419,7 @@ def smooth_image(equations: Equations, estimate: Estimate) -> Array:
     radius.
     """
     every = []
-    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of the polynomials; of r^2 in displacements along the radius
+    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # degree of polynomials; powers of r^2 along the radius
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
     for name in equations.sights.cameras:
         camera = estimate.cameras[name]

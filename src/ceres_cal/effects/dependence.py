@@ -292,8 +292,8 @@ class Scatter(Frozen):
 def scattered(reduced: ReducedInformation, scatter: Scatter | None) -> Information:
     """The information of observations and priors on everything shared, as the observations scatter.
 
-    The prior on targets as built describes a scatter of their own. If it were trusted more than the correlated
-    observations, halves of real boards would differ by 1.7 times what was stated.
+    The prior on targets as built describes a scatter of their own, so it is widened with the observations. Otherwise,
+    where errors are correlated, halves of real boards differed by 1.7 times what was stated.
     """
     if scatter is None:
         return reduced.shared
@@ -364,7 +364,7 @@ class _ReadOut(Frozen):
 
     @classmethod
     def of(cls, model: Linearised, estimate: Estimate) -> _ReadOut | None:
-        """From views of boards that only one camera sees, since a contradiction with another may be due to another
+        """Estimate it from views of boards that only one camera sees, since a contradiction may be due to another
         moment; None where there are few, or where they do not seem to be displaced.
         """
         fewest, enough = 5, 20  # views: the least that are tested, and those from which the size is estimated

@@ -42,7 +42,7 @@ def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[
 
 
 class AsBuilt(Frozen, eq=True):
-    """How far the features of one kind are off a target's drawing.
+    """The offsets of the features of one kind from a target's drawing.
 
     Attributes:
         target: its name. kind: "lines", "points", "warp", "heights" or "stretch". sigma_m: the standard deviation of

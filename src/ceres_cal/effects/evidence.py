@@ -124,7 +124,7 @@ _NO_SCATTER, _AS_IS = np.zeros(1), np.ones(1)
 
 
 class RandomEffects(Frozen):
-    """What residuals say of Q numbers, in the R independent directions that they determine.
+    """The information of residuals on Q numbers, in the R independent directions that they determine.
 
     Attributes:
         size: (R,) S of each direction. value: (R,) w. turn: (Q, R) U.
@@ -250,7 +250,7 @@ def shifts_by(taken: Array, moment: Array) -> Array:
 
 
 class RepeatedAmounts(Frozen):
-    """What the residuals say of Q amounts that are the same in all views, with everything else free.
+    """The information of the residuals on Q amounts that are the same in all views, with everything else free.
 
     Attributes:
         score: (Q,) u. information: (Q, Q) V. scores, informations: (S, Q) those of each sight by itself, or of each
@@ -356,8 +356,8 @@ class RepeatedAmounts(Frozen):
         )
 
     def _size(self, numbers: Indices, others: Others, prior: SizePrior) -> tuple[float, float]:
-        """Sigma and probability, where errors correlated within a sight count as noise. The prior's, where too few
-        sights determine that noise.
+        """Sigma and probability, where errors correlated within a sight count as noise; those of the prior, if there
+        are too few sights to determine that noise.
         """
         # Share of the largest eigenvalue above which a direction counts. The free numbers absorb nearly all of less
         # determined directions, and what they do not follow counts there a thousandfold: a board's shear of 3 %

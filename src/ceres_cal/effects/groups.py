@@ -38,7 +38,7 @@ FEWEST_GROUPS = 3
 # their own numbers, as of cameras side by side, leave only rounding: the ratio to that was 17 000 where nothing was
 # wrong.
 _LEAST_LEFT = 1.0
-_LOG_C = np.linspace(0.02, 6.0, 300)  # of either sign, with an exponential prior of mean 1 if views scatter otherwise
+_LOG_C = np.linspace(0.02, 6.0, 300)  # log c of either sign; exponential prior of mean 1 if views scatter otherwise
 
 
 class GroupNormals(Frozen):
@@ -220,7 +220,7 @@ def posed(normals: Array) -> Array:
 
 
 class GroupScatter(Frozen, eq=True):
-    """How views or placements scatter.
+    """The scatter of views or placements.
 
     Attributes:
         groups: number of groups compared. variance: factor on the variance, beyond the effect of errors within groups.
@@ -234,8 +234,8 @@ class GroupScatter(Frozen, eq=True):
 
 
 def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[GroupScatter, Array] | None:
-    """How the groups scatter, and the covariance (P, P) of the whole score that includes this; None where the groups
-    have too little in common to be compared.
+    """Compare groups: their scatter, and the covariance (P, P) of the whole score that includes it; None where they
+    have too little in common.
 
     Args:
         groups: in directions in which the information of everything is the unit matrix.
@@ -245,7 +245,7 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
     values, vectors = np.linalg.eigh(whole)
     values = np.maximum(values, 1e-12 * values[-1])
     white, root = (vectors * values**-0.5) @ vectors.T, (vectors * values**0.5) @ vectors.T
-    seen = _seen_by(groups)  # of the placements of a rig, only those in the sampled views
+    seen = _seen_by(groups)  # placements of a rig count only in the sampled views
     turn, own_white = np.linalg.qr(white @ seen)
     normal, gradient = seen.T @ groups.normal @ seen, groups.gradient @ seen
     expected, spread = _expected(normal, seen.T @ scatter @ seen, seen.T @ whole @ seen, own_white.T)

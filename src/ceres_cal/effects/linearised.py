@@ -40,7 +40,7 @@ class Weights(Frozen):
 
     @property
     def within_sigma(self) -> Weights:
-        """The same with the robust weights included in the standard deviations, as the solver has them."""
+        """These weights with the robust ones included in the standard deviations, as the solver has them."""
         return Weights(self.inverse_sigma * np.sqrt(self.robust), self.used, np.ones_like(self.robust))
 
 
@@ -75,7 +75,7 @@ class AddedNumbers(Frozen):
 
     @property
     def decrease(self) -> float:
-        """By how much the sum of squared residuals falls."""
+        """The decrease of the sum of squared residuals."""
         return float(self.step @ self.step)
 
 
@@ -280,7 +280,7 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
 
 
 def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, Indices]:
-    """The same for a stack (..., Q, Q): roots (..., Q, Q), whose first columns are 0 if left out, and ranks."""
+    """`inverse_root` of a stack (..., Q, Q): roots (..., Q, Q), with columns of 0 first where left out, and ranks."""
     scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
     values, vectors = np.linalg.eigh(scale[..., :, None] * normals * scale[..., None, :])
     kept = values > least

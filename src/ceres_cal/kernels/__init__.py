@@ -402,9 +402,10 @@ def strands_left(
         rows: (M, S, Z) along the eigenvectors: six of private placements, those of shared numbers, the residual.
         group: (S,) number of the private placement. shares: (A,).
         logs: (A,) to which the log determinants of all R and of the information on private placements are added.
-        left: (A, Z - 6, Z - 6) sum of X^T R^-1 X without private placements, which are then eliminated from it.
+        left: (A, Z - 6, Z - 6) sum of X^T R^-1 X without the columns of private placements, whose elimination is then
+            subtracted from it.
 
     Returns:
-        The number of numbers that were eliminated.
+        How many numbers were eliminated.
     """
     return int(core().strands_left(values, bounds, group, rows, shares, logs, left))

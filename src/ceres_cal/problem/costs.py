@@ -44,9 +44,7 @@ class Run:
 
 
 class CostValue(NamedTuple):
-    """The parameters `at` which a cost was evaluated, the residuals (N,), and the flat Jacobian (N, size) by each
-    block.
-    """
+    """A value of a cost: the parameters `at`, the residuals (N,) and the flat Jacobian (N, size) by each block."""
 
     at: Array
     residuals: Array
@@ -217,7 +215,7 @@ class EliminatedCost(_SightsCost):
         free, count = self._unknowns.free, len(self._structure.values)
         self._size = len(free) + count
         start = np.concatenate([self._optics.intrinsics[free], self._structure.values])
-        # The kernels know only offsets; without dimensions among the numbers it is the unit matrix of size + 1.
+        # From the numbers to the offsets, which the kernels work with; None where these are the same.
         self._chain, lead = self._structure.chain(len(free), 1), len(free) + self._unknowns.structure
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
         # Every step starts from the poses of the last accepted one: a rejected step may have moved them to another

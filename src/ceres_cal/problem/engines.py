@@ -24,7 +24,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.shares import Share, ShareRequest
 
 _A = TypeVar("_A")
-_RETRIES = 3  # of the work of a worker that was lost
+_RETRIES = 3  # repetitions of the work of a lost worker
 _PAUSE_S = 0.05  # before the work of a lost worker is repeated, four times as long each time
 _NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
 _NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"

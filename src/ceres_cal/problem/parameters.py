@@ -40,7 +40,7 @@ class OneLens(Frozen, eq=True):
 
 
 class Options(Frozen, eq=True):
-    """What to solve for and how.
+    """Options of a calibration: what to solve for, and how.
 
     Attributes:
         lens: one of `scene.lens.LENSES`, or "auto": chosen from the data.

@@ -139,7 +139,7 @@ class GaussianPrior(Frozen):
         """(K,) offsets of numbers that differ from the mean by `off`, and their derivatives by `off`. For numbers with
         normal logarithms, the offset is far below 0 where the number is 0 or less.
         """
-        least_ratio = 1e-6  # of a number to its mean: a step of the solver may go below 0
+        least_ratio = 1e-6  # least ratio of a number to its mean: a step of the solver may go below 0
         slope = np.ones(len(off))
         if self.logs:
             at = self._of_logs
@@ -216,7 +216,7 @@ def stated_priors(
     for prior in dict.fromkeys((*observations.priors, *options.priors)):  # a repeated statement counts once
         observations.require_owner(prior)
         is_effect = prior.is_coma and prior in observations.priors
-        if not (prior.is_open or prior.curve or is_effect):  # a prior on a curve is a tolerance
+        if not (prior.is_open or prior.curve or is_effect):  # open dimensions have no prior; curves have tolerances
             stated[prior] = stated_prior(prior, lenses.get(prior.name) or options.of_camera(prior.name).blank_lens)
     return stated
 

@@ -21,7 +21,7 @@ _CONVEX = ("trivial", "huber", "soft_l1")
 
 
 class Weighting(Frozen, eq=True):
-    """How residuals become costs.
+    """The weighting of residuals: how they become costs.
 
     Attributes:
         point_scale, curve_scale: noise scales, factors on the stated sigmas.
@@ -97,7 +97,7 @@ class Problem(Frozen):
         return [*self.stated_at(estimate), *chain.from_iterable(smooth)]
 
     def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
-        """The same as normal distributions at an estimate: usual values count less, the farther off they are."""
+        """`priors_of` as normal distributions at an estimate: usual values count less, the farther off they are."""
         return [prior.weighted_at(estimate) for prior in self.priors_of(estimate)]
 
     def stated_at(self, estimate: Estimate) -> list[GaussianPrior]:

@@ -358,7 +358,7 @@ def redrawn(target: Target, lengths_m: Mapping[str, float]) -> Target:
 
 
 def _differences(name: str, target: Target, other: Target) -> Iterator[tuple[str, float]]:
-    """By how much each structure number, in m, must change to turn one target into another."""
+    """The change of each structure number, in m, that turns one target into another."""
     for feature, curve in target.curves.items():
         there = other.curves[feature]
         if isinstance(curve, Arc) and isinstance(there, Arc):

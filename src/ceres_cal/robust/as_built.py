@@ -166,12 +166,12 @@ def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) ->
 def _beside_views(
     every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: ViewEffects
 ) -> Iterator[AsBuilt]:
-    """The same with the probabilities that remain where single views may be displaced in their own ways, too.
+    """The kinds with the probabilities that remain where single views may be displaced in their own ways, too.
 
     What was subtracted from the views depends on the offsets that were found and would confirm them: halves of a set of
     pictures with a rolling shutter found the board .4 % longer and .9 % shorter, each with probability 1.
     """
-    most_sights = 40  # of a camera, since each sight has its own unknowns
+    most_sights = 40  # sights of a camera, since each has its own unknowns
     targets = end.problem.observations.targets
     structure = whole_structure(targets, {one.target for one in every if one.kind == "heights"})
     equations, weights = _equations(stated, end, some_sights(end.problem.sights, most_sights), views)
@@ -186,8 +186,8 @@ def _beside_views(
 
 
 def shifts_as_drawn(every: Sequence[AsBuilt], end: RobustSolution) -> tuple[Sequence[Key], list[Array]]:
-    """Keys (K), and the vectors (K,) by which they move if a doubtful kind of features is where it is drawn, as far as
-    that is probable.
+    """Keys (K), and vectors (K,) by which they move if a doubtful kind of features is where it is drawn, times the root
+    of the probability of that.
 
     Args:
         end: with everything solved for that likely differs from its drawing.
@@ -262,7 +262,7 @@ def _change(now: Construction, before: Construction) -> float:
 
 
 def _measured(every: Sequence[AsBuilt], structure: Structure, targets: Mapping[str, Target]) -> Iterator[AsBuilt]:
-    """The same with the offsets that resulted from the last solve."""
+    """The kinds with the offsets that resulted from the last solve."""
     numbers = numbers_by_kind(structure, targets)
     for one in every:
         values, size_m = structure.values[numbers[one.target, one.kind]], _longer_side_m(targets[one.target])

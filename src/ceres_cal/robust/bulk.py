@@ -1,8 +1,8 @@
 """Solve for very many observations of the world: a subset decides what there is, and all observations take part.
 
 The subset goes through all steps of a calibration: the choice of the lens, outliers as a whole, targets as built. From
-its end, which differs from the answer by standard deviations of the subset, all observations are judged and solved for
-together, in shares that answer with sums (`shares`): in this process, or on workers.
+its end, which is off by about a standard deviation of the subset, all observations are judged and solved for together,
+in shares that answer with sums (`shares`): in this process, or on workers.
 """
 
 from __future__ import annotations
@@ -309,7 +309,7 @@ class _SumRounds(Rounds[_SumRound]):
         return RowSelection(used.sums, (p[first], c[then]), (far_p[first], far_c[then]))
 
     def _used_here(self) -> RowSelection:
-        """The same for the rows that are not of the world."""
+        """The rows of the subset that are not of the world: which take part, and how far off the others are."""
         sums, rows, sigmas = [], [], []
         columns = self._few.points, self._few.curves
         each = zip(

@@ -3,7 +3,7 @@
 A line that is misplaced as a whole is not found row by row: the fit moves half of the way towards it, none of its rows
 is an outlier, and good rows elsewhere become outliers. So for each curve in each frame, each feature over all frames,
 each frame and each placement, the question is whether the rest is better explained without it. The linear model at the
-end of all rounds names a few suspects (see `offsets`), a solve without each of them shows what the rest predicts for
+end of all rounds names a few suspects (`Offsets`), a solve without each of them shows what the rest predicts for
 it, and the more probable explanation is taken.
 
 A few rows of a few views decide whether a group is wrong: views that stand out, and others taken evenly. So of very
@@ -99,9 +99,9 @@ class _Trial(Frozen):
     """The result of a solve without the suspects.
 
     Attributes:
-        end: the end of that solve. rows: (N + M,) those of the suspects. log_odds: the least of the suspects, that they
-            are wrong.
-        explanations: one of each suspect. next: the group that is suspected next, if any.
+        end: the end of that solve. rows: (N + M,) those of the suspects. log_odds: the least log odds that one
+            of them is wrong.
+        explanations: one for each suspect. next: the group that is suspected next, if any.
     """
 
     suspects: _Suspects
@@ -304,7 +304,7 @@ def rows_compared(groups: ObservationGroups, end: RobustSolution, taking_part: M
     Args:
         taking_part: (N + M,) the rows that may be chosen. recalled: (N + M,) rows that are compared even if rejected.
     """
-    most_rows = 40  # of a group in one view
+    most_rows = 40  # rows of a group in one view
     inside, view = taking_part & (end.inliers.rows | recalled), column_of(groups.observations, "view")
     rows = np.flatnonzero(inside & views_compared(groups, end, inside, recalled)[view])
     inside[:] = False

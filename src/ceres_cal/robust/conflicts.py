@@ -58,7 +58,7 @@ _LEAST_TOLD = 1e-7  # share of the information on a number that the rest must co
 
 
 class Rest(Frozen):
-    """What everything else says of a statement's numbers: a step from an estimate, its information, and freedom."""
+    """A statement's numbers by everything else: a step from an estimate, its information, its degrees of freedom."""
 
     estimate: Estimate
     step: Array

@@ -90,7 +90,7 @@ class _EffectGroup(Frozen):
 
 
 class _Amounts(Frozen):
-    """What the residuals say of the amounts of all effects.
+    """The information of the residuals on the amounts of all effects.
 
     Attributes:
         taken: (K, Q) by how much the shared numbers move with each amount. groups: by number.
@@ -123,7 +123,7 @@ class _Amounts(Frozen):
                     groups.append(_EffectGroup(effect, columns, number, own))
                 size += parts[-1].size
         every = SparseColumns.side_by_side(parts, len(equations))
-        # With few views, curves show how far correlated errors displace, but not by how much a lens is wrong.
+        # With few views, curves show how far correlated errors displace, but not how a lens is wrong.
         fewest_sights = 3  # sights from which on an effect differs from what a wrong lens leaves
         few = len(problem.sights) < fewest_sights
         repeated = RepeatedAmounts.of(model, every, strand_names(equations, equations.sight) if few else None)

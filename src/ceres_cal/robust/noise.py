@@ -164,8 +164,9 @@ def judge(
 ) -> Inliers:
     """Estimate the noise scales and the inliers at one estimate.
 
-    The median gives a first scale that up to half of the data may not spoil. The spread of the inliers gives the final
-    scale; where the noise has tails, more observations are inliers than lie within the bound of the first scale.
+    The median gives a first scale, which outliers cannot spoil as long as they are less than half of the data. The
+    spread of the inliers gives the final scale; where the noise has tails, more observations are inliers than lie
+    within the bound of the first scale.
 
     Args:
         options: the rejection bound, and whether the stated sigmas hold (scale 1).

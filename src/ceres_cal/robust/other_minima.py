@@ -2,7 +2,7 @@
 
 A small or distant board looks almost the same tilted either way, and each of the two mirrored poses of its plane has a
 minimum of its own. Only trying both shows which is the lower one. They are tried where they compete, that is, where
-perspective is too weak to have decided at the start.
+perspective is too weak to have decided in the initial estimate.
 
 From a poor initial estimate, most of a board's corners may lie outside the rejection bound, and rejected observations
 do not attract the pose. With the lens solved from the other boards, four good corners give a lost board a pose by
@@ -202,7 +202,7 @@ def least_of_few(
         elsewhere: initial estimates that explained the observations equally well. is_whole: whether the problem has all
             the observations; rejected ones were judged in their own minimum.
     """
-    lower = 1.0  # of twice the cost: rounding is smaller, and a minimum lower by less than this is as likely
+    lower = 1.0  # difference of twice the cost: rounding is smaller, and a minimum lower by less is as likely
     is_few, turned = is_whole and problem.sights.equations < FEW, tuple(_seen_turned(problem.sights, estimate))
     if not (is_few or turned):
         return estimate, ()
@@ -250,7 +250,7 @@ def minima_of(
         others: solutions with their cost above that of the estimate. information: of the model, about the K numbers.
         half_width: of an interval, in standard deviations.
     """
-    alike = 0.01  # of natural sizes: solves whose ends are no farther apart have found the same minimum
+    alike = 0.01  # share of natural sizes: ends of solves that are no farther apart are the same minimum
     sizes = natural_sizes(estimate, information.keys)
     shifts, odds = list[Array](), list[float]()
     here = np.zeros(len(sizes))
@@ -308,7 +308,7 @@ def solved_soon(problem: Problem, start: Estimate, *, is_near: bool = True) -> S
     """The end of a short solve; None where it finds nothing. Along a flat valley the solver would make hundreds of
     small steps that change nothing here.
     """
-    near = 1e-6  # of a variance: the end is off the minimum by a thousandth of a standard deviation
+    near = 1e-6  # variance that may remain: the end is off by a thousandth of a standard deviation
     short = replace(problem.options, max_iterations=min(30, problem.options.max_iterations))
     precision = near / max(problem.equations, 1)
     solution = solve(replace(problem, options=short), start, is_near=is_near, precision=precision)

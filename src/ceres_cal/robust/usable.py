@@ -31,7 +31,7 @@ from ceres_cal.scene.targets import Target
 _NEARER = 0.5
 _BELOW = 0.5  # share of the camera's height over the floor: noise lowers a board only by centimetres
 
-# Share of the image's diagonal (24 px for 1600 px wide images). If half of a camera's observations are farther off, it
+# Share of the image's diagonal: 24 px of 1600. If half of a camera's observations are farther off than this, the result
 # is no calibration; a lens that is too simple leaves at most a few pixels. Halving or doubling changes nothing.
 _NO_FIT = 0.015
 
@@ -202,7 +202,7 @@ def _lost(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterato
     shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < 0.5)]
     otherwise: Mapping[tuple[str, str], str] = {}
-    if any(key.placement not in (None, *sights.seen_once) for key, _ in lost):  # of a rig
+    if any(key.placement not in (None, *sights.seen_once) for key, _ in lost):  # shared by a rig
         from ceres_cal.start.same_moments import shown_otherwise
 
         otherwise = shown_otherwise(problem.observations)

@@ -68,7 +68,7 @@ def _by_own_poses(problem: Problem, estimate: Estimate) -> dict[str, float]:
 
 
 def shifted(observations: Observations) -> Iterator[str]:
-    """In words, each station whose frames match those of the first one after a shift."""
+    """Descriptions of stations whose frames match those of the first one only after a shift."""
     alike = 0.15  # difference that initial estimates of equal poses may have, see `same_labels`
     for moments in _moments(observations):
         costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
@@ -82,7 +82,7 @@ def shifted(observations: Observations) -> Iterator[str]:
 
 
 def told_apart(observations: Observations) -> Iterator[str]:
-    """In words, why stations may contradict one another: their frames, or the order of boards' points."""
+    """Descriptions of why stations may contradict one another: their frames, or the order of boards' points."""
     yield from shifted(observations)
     if every := listed_otherwise(observations):
         (station, placement), words = next(iter(every.items()))

@@ -233,7 +233,7 @@ class Sightlines(Frozen):
         which its rays meet a plane one metre below. Where everything leaves it undetermined, the position is above the
         middle of the places.
         """
-        rounds = 2  # of reweighting against wrong labels
+        rounds = 2  # rounds of reweighting against wrong labels
         d = rotations @ self._rays(log_phi, np.zeros(len(log_phi)))
         d /= np.sqrt(_dot(d, d))[:, None]
         straight = slice(0, self._arcs.start)

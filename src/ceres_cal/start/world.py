@@ -21,7 +21,7 @@ from ceres_cal.start.sightlines import CameraPrior, Candidates, Sightlines
 _MOST = (20, 12)  # points of a sight, and places of each curve, that a search for a camera uses
 _HOLDS = 0.7  # share of rows that must be near for a place to hold: a fifth and more, of any features, may be wrong
 _SCALES = 8.0  # scales of the residuals within which a row is near: no clean row is farther
-_ROUGH = 0.01  # of the half diagonal, beyond which no row is near: at a wrong place the scale is large
+_ROUGH = 0.01  # share of the half diagonal beyond which no row is near: at a wrong place the scale is large
 _LEFT_OVER = 8  # degrees of freedom for a place to hold: with fewer, another place may explain the rows as well
 _TOLD = 0.05  # standard deviation of log phi up to which a sight determines phi: above, the start is called a guess
 _OPEN = 1e-10  # least eigenvalue of the normalised information: rounding is less, the weakest scenes have 1e-7
@@ -122,7 +122,7 @@ def _at_rest(
     sight: Sights, lines: Sightlines, profile: RadialProfile, found: BestCameras
 ) -> tuple[Sightlines, RadialProfile, BestCameras]:
     """The best places and those that fit as well, refined by nearly all rows of a sight instead of some."""
-    most_places = 5  # that are returned: a valley has as many as were tried, and the solve follows it from any of them
+    most_places = 5  # places returned: a valley has as many as were tried, and the solve follows it from any
     alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
     # Depending on which twelve places of a curve were used, a wide lens' field was found or lost, and phi was
     # determined or a guess.

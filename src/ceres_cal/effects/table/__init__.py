@@ -45,7 +45,7 @@ def columns_of_all(case: Case) -> list[EffectColumns]:
 
 
 class JointStep(Frozen):
-    """What is wrong with the model of a case, all together.
+    """All errors of the model of a case, together.
 
     Attributes:
         causes: groups of effects, with their likeliest amounts (Q,).
@@ -56,7 +56,7 @@ class JointStep(Frozen):
 
     @cached_property
     def moves(self) -> dict[Key, float]:
-        """By how much each free number moves."""
+        """The change of each free number."""
         keys = free_keys(self.case.estimate, self.case.problem.layout, self.case.problem.private)
         steps = [self.case.model.taken_by(score.columns) @ amount for score, amount in self.causes]
         return dict(zip(keys, np.sum(steps, axis=0).tolist(), strict=True)) if steps else {}
