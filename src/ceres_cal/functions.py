@@ -42,14 +42,14 @@ def detect_board(
             AprilGrid or markers.
         camera: its name in the observations. station: its name there, by default the camera's.
         corner_fit: "saddle", which also measures boards partly out of the picture, or "opencv".
-        frames: how many to take out of each video.
+        frames: number of frames to extract from each video.
         folder: where these are kept; by default they are not.
         progress: called after each image with (steps done, steps in all, file name).
 
     Raises:
         InputError: an image cannot be read, or no image shows the board.
     """
-    detect.finder_of(board, corner_fit)  # or says what does not fit, before any video is read
+    detect.finder_of(board, corner_fit)  # raises for what does not fit, before any video is read
     photographs, videos = images_and_videos(images)
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         photographs += detect.frames_of_videos(videos, frames, Path(place), progress)
@@ -78,17 +78,19 @@ def detect_field(
     """Find the painted lines of a field in photographs of one station.
 
     Args:
-        images: photographs that one camera took at one station, or a function that makes them, which is called once
-            all else is found to fit. target: the field, such as `ssl_field("B")`; by
-            default that of the calibration to start from.
-        start: where the camera was before, or four named points or more with their pixels, roughly. Without a start
+        images: photographs that one camera took at one station, or a function that returns them, which is called after
+            all other arguments were checked. target: the field, such as `ssl_field("B")`; by default that of the
+            calibration to start from.
+        start: where the camera was before, or four or more named points with their approximate pixels. Without a start
             the field is found in the photograph.
-        auto: find the field also where a calibration is given as start, however far the camera has moved.
-        facing: which way round a symmetric field is: a line or point -> the side of the picture that it lies towards,
-            such as {"LeftGoalLine": "top"}.
+        auto: whether to find the field also where a calibration is given as start, however far the camera has moved.
+        facing: orientation of a symmetric field: a line or point -> the side of the picture towards which it lies, such
+            as {"LeftGoalLine": "top"}.
         not_painted: lines of the target that this field does not have. estimate: dimensions to solve for.
-        mask: a picture of the same size; what is black in it is left out. edges: both edges of each line.
-        points: corners and crossings, too, where the lines' places lead to. keep_start: the start is good to 12 px.
+        mask: a picture of the same size; its black parts are left out. edges: whether to measure both edges of each
+            line.
+        points: whether to measure corners and crossings, too, where the lines lead to. keep_start: the start is
+            accurate to 12 px.
         camera: its name in the observations, by default that of the calibration, or "camera". station: likewise.
         refused: called with the path of each image that does not show the field, and what was seen in it.
         progress: called after each image with (steps done, steps in all, file name).
@@ -135,10 +137,10 @@ def detect_field(
 def lines_to_find(
     target: Target, facing: Mapping[str, str], not_painted: Sequence[str] = (), lengths: Sequence[Prior] = ()
 ) -> list[str]:
-    """The lines of a field that are looked for in photographs.
+    """Return the lines of a field that are searched for in photographs.
 
     Raises:
-        InputError: what is said of the field does not fit it: see `detect_field`.
+        InputError: an argument does not fit the field: see `detect_field`.
     """
     sides = [detect.Facing(*one) for one in facing.items()]
     for name in not_painted:
@@ -151,7 +153,7 @@ def lines_to_find(
 
 
 def field_of(calibration: Calibration) -> Target | None:
-    """The only target of a calibration with painted lines; None where there are several, or none."""
+    """Return the only target of a calibration with painted lines; None where there are several, or none."""
     fields = [one for one in calibration.targets.values() if detect.is_painted(one)]
     return fields[0] if len(fields) == 1 else None
 
@@ -160,10 +162,10 @@ def field_of(calibration: Calibration) -> Target | None:
 
 
 def join(*observations: Observations, same_frame: str | None = None) -> Observations:
-    """The observations of a rig's cameras together, with board labels that agree between the cameras.
+    """Combine the observations of a rig's cameras, with board labels that agree between the cameras.
 
     Args:
-        same_frame: which frames are one moment, such as "left*,right*" or "index"; by default those of one name.
+        same_frame: rule for frames of one moment, such as "left*,right*" or "index"; by default, frames of one name.
 
     Raises:
         InputError: sets that contradict one another, or a rule that fits no frames.
@@ -196,8 +198,8 @@ def check(
 
     Args:
         observations: new observations; or photographs, which are searched for the field of the calibration.
-        false_alarms: how often unmoved cameras may be said to have moved, in so many `checks` together.
-        station: that took the photographs; may be left out where there is only one.
+        false_alarms: probability that unmoved cameras are reported as moved, in so many `checks` together.
+        station: that took the photographs; may be omitted where there is only one.
         not_painted: lines that the photographed field does not have. progress: called after each photograph.
 
     Raises:
@@ -228,16 +230,16 @@ def refit(
 
     Args:
         observations: new observations; or photographs of one station, searched for the targets of the calibration.
-        what: what is free. "pose": poses, the intrinsics under what is known of them; "pose-only": poses alone; "zoom":
-            phi, too; "iris": the lens's coefficients, too; "everything": all intrinsics, too; "auto": as "pose", or as
-            "zoom" or "iris" where the observations say so.
+        what: what is free. "pose": poses, with the posterior of the intrinsics as a prior; "pose-only": poses alone;
+            "zoom": phi, too; "iris": the lens's coefficients, too; "everything": all intrinsics, too; "auto": as
+            "pose", or as "zoom" or "iris" where the observations say so.
         moved: observed stations that moved; by default all. progress: called at every iteration of every solve.
         station: that took the photographs. not_painted: lines that the photographed field does not have.
 
     Raises:
-        InputError: names that do not fit, or a calibration that does not say how well it is known.
-        DegenerateError: the observations cannot determine a pose.
-        SolutionError: nothing explains the observations, or something that `what` does not allow for.
+        InputError: names that do not fit, or a calibration without a posterior.
+        DegenerateError: the observations do not determine a pose.
+        SolutionError: nothing explains the observations, or something does that `what` does not allow.
     """
     if not isinstance(observations, Observations):
         images = image_files(observations)

@@ -1,4 +1,4 @@
-"""Reading what is left over: a table, what it says of the model."""
+"""Diagnosis of residuals: a table, summaries, and what they show about the model."""
 
 from ceres_cal.base.frozen import names_of
 

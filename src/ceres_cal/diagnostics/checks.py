@@ -1,5 +1,5 @@
-"""Checks of a diagnosis beside the effects: wrong labels, larger noise, neighbours that agree, a calibration that does
-not hold on new observations; and what a diagnosis is about.
+"""Checks of a diagnosis besides the effects: wrong labels, larger noise, correlated neighbours, and a calibration that
+does not hold on new observations; also the case that is diagnosed.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from ceres_cal.robust.noise import LARGER, Inliers
 from ceres_cal.robust.usable import is_another
 from ceres_cal.scene.curves import nearest_on_track
 
-# Pairs of neighbours: the correlation of 20 is known to 0.2. Nothing changes from half to double.
+# Fewest pairs of neighbours: 20 determine the correlation to 0.2. Nothing changes from half to double.
 _FEWEST_PAIRS = 20
 
 
 class Noise(Frozen, eq=True):
-    """The noise of one kind, with the named causes taken off.
+    """The noise of points or of curves, with the named causes subtracted.
 
     Attributes:
-        kind: "points" or "curves". observations: inliers. sigma_px: typical standard deviation (of each coordinate of a
-            point, of the distance to a curve). scale: factor on the stated sigmas; stated_px: their root mean square,
-            NaN where nobody stated one (all are 1).
-        log_p: natural logarithm of the probability of so much, were the noise LARGER times what was stated.
+        kind: "points" or "curves". observations: number of inliers. sigma_px: typical standard deviation (of each
+            coordinate of a point, of the distance to a curve). scale: factor on the stated sigmas; stated_px: their
+            root mean square, NaN where nobody stated one (all are 1).
+        log_p: natural logarithm of the probability of so much noise, if it were LARGER times what was stated.
         correlation: of neighbouring residuals (along a line, between a board's corners), NaN where there are too few.
-        correlation_log_p: of so much correlation in white noise. effective: observations that would say as much if
-            they were independent.
+        correlation_log_p: natural logarithm of the probability of so much correlation in white noise. effective: number
+            of independent observations with as much information.
     """
 
     kind: str
@@ -50,15 +50,15 @@ class Noise(Frozen, eq=True):
 
     @property
     def inflation(self) -> float:
-        """How many observations weigh as much as one independent one."""
+        """Number of observations that weigh as much as one independent one."""
         return self.observations / self.effective if self.observations else 1.0
 
 
 def measure_noise(model: Linearised, before: Linearised, inliers: Inliers) -> tuple[Noise, ...]:
-    """The noise of points and of curves, where there are any.
+    """Return the noise of points and of curves, where there are any.
 
     Args:
-        model: with the named causes taken off. before: the calibration's own. inliers: with its noise scales.
+        model: with the named causes subtracted. before: the calibration's own. inliers: with its noise scales.
     """
     answer = []
     for is_curve, kind, scale in ((False, "points", inliers.point_scale), (True, "curves", inliers.curve_scale)):
@@ -87,7 +87,7 @@ def _noise_of(model: Linearised, kind: str, rows: Mask, own_scale: float, own_va
 
 
 def _neighbours(model: Linearised, kind: str) -> tuple[Indices, Indices]:
-    """Pairs of used equations: next to one another along a line of one view, or on one row of a board."""
+    """Return pairs of used equations: neighbours along a line of one view, or on one row of a board."""
     equations = model.equations
     if kind == "curves":
         rows = np.flatnonzero(model.used & equations.is_curve)
@@ -111,13 +111,13 @@ def _neighbours(model: Linearised, kind: str) -> tuple[Indices, Indices]:
 
 
 def _successive(rows: Indices, *keys: AnyArray) -> tuple[Indices, Indices]:
-    """Rows and their successors in the order of the last key, then the one before it, and so on."""
+    """Return rows and their successors in the order of the last key, then the one before it, and so on."""
     order = rows[np.lexsort(keys)]
     return order[:-1], order[1:]
 
 
 def _correlation(model: Linearised, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:
-    """Correlation of neighbouring residuals beyond what the fit makes of white noise, and log P of so much."""
+    """Return the correlation of neighbouring residuals beyond that of fitted white noise, and log P of so much."""
     first, second = pairs
     if len(first) < _FEWEST_PAIRS:
         return float("nan"), 0.0
@@ -131,13 +131,13 @@ def _correlation(model: Linearised, pairs: tuple[Indices, Indices], variance: fl
 
 
 class DiagnosisCase(Case):
-    """What is diagnosed.
+    """The case that is diagnosed.
 
     Attributes:
-        labels: groups of observations that another feature explains. labels_tried: how many were looked at.
-        calibration: of other observations, which may not hold on these; None where these are its own.
-        as_built, effects: what the calibration found not to be as drawn, and what else displaces the observations;
-            both were solved for.
+        labels: groups of observations that another feature explains. labels_tried: number of groups examined.
+        calibration: from other observations, which may not hold on these; None where these are its own.
+        as_built, effects: what the calibration found to differ from drawings, and other effects that displace the
+            observations; both were solved for.
     """
 
     inliers: Inliers
@@ -150,7 +150,7 @@ class DiagnosisCase(Case):
 
 
 class TestResults(Frozen):
-    """A case, the effects that its residuals speak for, the noise that these leave, the rate of false alarms."""
+    """A case, the effects that its residuals support, the noise that these leave, and the rate of false alarms."""
 
     case: DiagnosisCase
     selection: Selection
@@ -159,7 +159,7 @@ class TestResults(Frozen):
 
 
 def wrong_labels(tested: TestResults) -> Iterator[Finding]:
-    """Labels that stand for another feature, over all its frames."""
+    """Yield findings of labels that stand for another feature, each over all its frames."""
     groups: dict[tuple[bool, str, int, int], list[WrongLabel]] = defaultdict(list)
     for label in tested.case.labels:
         if label.log_p <= tested.selection.log_level:
@@ -200,10 +200,10 @@ def _mean(values: Array) -> float:
 def _of_noise(
     kind: str, about: Callable[[Noise], tuple[float, float, Words]], tested: TestResults
 ) -> Iterator[Finding]:
-    """What the noise of points and of curves is like.
+    """Yield findings about the noise of points and of curves.
 
     Args:
-        about: of either, log P of as much by chance, px that it is of, and its words.
+        about: returns log P of so much by chance, its size in px, and its words, for either.
     """
     case = tested.case
     for noise in tested.noise:
@@ -219,7 +219,7 @@ def _of_noise(
 
 
 def larger(noise: Noise) -> tuple[float, float, Words]:
-    """Noise beyond what was stated."""
+    """Return log P, size in px and words of noise beyond what was stated."""
     sentence = (
         f"the noise of {noise.kind} is {noise.scale:.2f} times what was stated: {noise.sigma_px:.3f} px, not "
         f"{noise.sigma_px / noise.scale:.3f}"
@@ -230,7 +230,7 @@ def larger(noise: Noise) -> tuple[float, float, Words]:
 
 
 def correlated(noise: Noise) -> tuple[float, float, Words]:
-    """Neighbouring residuals that agree."""
+    """Return log P, size in px and words of the correlation of neighbouring residuals."""
     sentence = (
         f"neighbouring residuals of {noise.kind} agree (correlation {noise.correlation:.2f}): "
         f"{noise.observations} observations say as much as {noise.effective:.0f} independent ones"
@@ -242,11 +242,11 @@ def correlated(noise: Noise) -> tuple[float, float, Words]:
 
 
 def does_not_hold(tested: TestResults) -> Iterator[Finding]:
-    """A refit to new observations would fit them better than chance explains.
+    """Yield a finding where a refit to new observations would fit them better than chance explains.
 
-    The gain of a refit is chi-square where the calibration is exact; its own uncertainty adds as much again for every
-    time that the new observations are as many as those it was made from. That holds where both see the same part of the
-    image: what is new at places that the calibration never saw is held against it.
+    The gain of a refit is chi-square if the calibration is exact; its own uncertainty adds as much again for every time
+    that the new observations are as many as those it was made from. This holds where both see the same part of the
+    image: differences at places that the calibration never saw count against it.
     """
     case, model = tested.case, tested.case.model
     step, used = model.step, model.used
@@ -277,12 +277,12 @@ CHECKS: dict[str, tuple[Callable[[TestResults], Iterator[Finding]], Callable[[Di
     "correlated": (partial(_of_noise, "correlated", correlated), lambda case: 2),
     "does not hold": (does_not_hold, lambda case: 1),
 }
-"""Kinds of findings that are no columns over the equations: those whose probability is at most the selection's level,
-and how many tests are made of a case: they share the rate of false alarms with the effects."""
+"""Kinds of findings that are no columns over the equations: what yields those whose probability is at most the
+selection's level, and the number of tests on a case, which share the rate of false alarms with the effects."""
 
 
 def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:
-    """The finding of an effect that the calibration found by itself, and has in it."""
+    """Return the finding of an effect that the calibration found and solved for."""
     case, structure = tested.case, tested.case.estimate.structure
     targets = case.problem.observations.targets
     numbers = numbers_by_kind(structure, targets)[one.target, one.kind]

@@ -1,4 +1,4 @@
-"""diagnose(): residuals read one by one, all together, and for what they say of the model."""
+"""diagnose(): the residuals one by one, summarised, and what they show about the model."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ if TYPE_CHECKING:
     from ceres_cal.diagnostics.summaries import Summaries
 
 FALSE_ALARM_RATE = 0.01
-"""Probability that a calibration of sound data gets any finding at all."""
+"""Probability that a calibration of sound data gets any finding."""
 
 
 class Diagnosis(Frozen):
-    """What the residuals say.
+    """The result of `diagnose`.
 
     Attributes:
-        findings: causes of what is left over, the largest first (by effect in px). None: what is left looks like noise.
+        findings: causes of the remaining residuals, the largest first (by effect in px); empty where they look like
+            noise.
         table: every observation.
-        noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
-        degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
-        conflicts: what was known beforehand and everything else contradicts, the calibration's own.
-        step: what the calibration would be with all causes taken into account at once that are wrong with the model.
-        new_data: whether the observations are others than those the calibration was made from. tests: how many
-            alternatives were tested, and false_alarm_rate: the probability that sound data get any finding at all,
-            Bonferroni over all of them. It holds for normal noise; what it does not hold for is said by "correlated".
+        noise: of points and of curves, with the findings subtracted; without findings it is the calibration's own.
+        degrees_of_freedom: spare equations behind the calibration's noise; infinite where sigmas are as stated.
+        conflicts: statements that everything else contradicts, from the calibration.
+        step: the calibration with all causes taken into account at once that are errors of the model.
+        new_data: whether the observations are not those of the calibration. tests: number of alternatives that were
+            tested, and false_alarm_rate: the probability that sound data get any finding, by Bonferroni over all of
+            them. It holds for normal noise; where it does not hold, there is a finding "correlated".
         model_error: whether some finding says that the model is wrong: then the covariance does not contain that error.
     """
 
@@ -71,7 +72,7 @@ class Diagnosis(Frozen):
         """Draw the residual vectors over one camera's image into Matplotlib's Axes; returns the Axes.
 
         Args:
-            camera: its name; may be left out where there is only one.
+            camera: its name; may be omitted where there is only one.
         """
         return drawn("residual_pictures.plot_residuals", self, ax, camera=camera)
 
@@ -99,25 +100,25 @@ def diagnose(
     new_data: bool = False,
     false_alarm_rate: float = FALSE_ALARM_RATE,
 ) -> Diagnosis:
-    """Read the residuals of a calibration.
+    """Examine the residuals of a calibration.
 
     Args:
-        new_data: that the observations are others than the calibration was made from. Residuals are then taken at the
-            calibration as it stands (only placements that it does not know are posed); the tests ask what would be left
-            if it were refitted to them, so that they judge the model and not the calibration's own uncertainty.
+        new_data: whether the observations are not those of the calibration. Residuals are then taken at the calibration
+            as it is (only placements that it does not know are posed); the tests are on what a refit to them would
+            leave, so that they judge the model and not the calibration's own uncertainty.
         false_alarm_rate: of all tests together.
 
     Raises:
-        InputError: the observations are not those of the calibration, and `new_data` does not say so; or they name
-            cameras or stations that it does not have.
-        SolutionError: another camera or target than those calibrated, or it can show none of them.
+        InputError: other observations than those of the calibration, without `new_data`; or cameras or stations that it
+            does not have.
+        SolutionError: another camera or target than those calibrated, or none of the observations can be shown.
     """
     observations = calibration.as_taken(observations)
     _require_known(calibration, observations, new_data)
     case = _case(calibration, observations, new_data)
     tested = _tested(case, false_alarm_rate)
     findings = list(_findings(tested))
-    if any(conflict.kind != "tolerance" for conflict in calibration.conflicts):  # which bends the rest to itself
+    if any(conflict.kind != "tolerance" for conflict in calibration.conflicts):  # these bias the rest
         findings = [replace(f, advice=f"{_FIRST}; {f.advice}") if f.is_model_error else f for f in findings]
     return Diagnosis(
         tuple(sorted(findings, key=lambda finding: -finding.effect_px)),
@@ -133,7 +134,7 @@ def diagnose(
 
 
 def _findings(tested: TestResults) -> Iterator[Finding]:
-    """Of effects, also of those that the calibration solved for by itself, and of checks."""
+    """Yield the findings of effects, including those that the calibration solved for, and of checks."""
     solved = _solved(tested.case)
     for effect in EFFECTS.values():
         for finding in effect.findings(tested.case, tested.selection):
@@ -166,7 +167,7 @@ def _require_known(calibration: Calibration, observations: Observations, new_dat
 
 
 def _case(calibration: Calibration, observations: Observations, new_data: bool) -> DiagnosisCase:
-    """Everything there is to read, with those that were taken out and may speak again."""
+    """Return the case with all observations, including rejected ones that may take part again."""
     problem = calibration.problem(observations, new_data=new_data)
     estimate = calibration.estimate
     if new_data:
@@ -193,7 +194,7 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
 
 
 def _judged(calibration: Calibration, observations: Observations, there: Residuals, new_data: bool) -> Inliers:
-    """The calibration's own verdict on its observations, a fresh one on new ones."""
+    """Return the calibration's own inliers of its observations; for new observations, judge them."""
     if new_data:
         return judge(observations, there, (1.0, 1.0), calibration.options)
     inliers, posterior = calibration.inlier_masks(observations), calibration.posterior
@@ -206,34 +207,35 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
 
 
 def _tested(case: DiagnosisCase, rate: float) -> TestResults:
-    """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
+    """Select alternatives at a rate of false alarms, and measure the noise that they leave."""
     alternatives = [EffectSums.of(case.model, columns) for columns in columns_of_all(case)]
     extra = sum(tests(case) for _, tests in CHECKS.values())
     selection = select(case.model, alternatives, rate, extra)
     noise = measure_noise(selection.model, case.model, case.inliers)
     level = selection.log_level
     inflation = max((one.inflation for one in noise if one.correlation_log_p < level), default=1.0)
-    if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
+    if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too sensitive
         selection = select(case.model, alternatives, rate, extra, inflation)
         noise = measure_noise(selection.model, case.model, case.inliers)
     return TestResults(case, selection, noise, rate)
 
 
-# Rejected observations of one line that must agree on its place: two determine it, three more do not by chance.
-# Nothing changes from half to double.
+# Rejected observations of one line that must agree on its position: two determine it, three more do not agree by
+# chance. Nothing changes from half to double.
 _FEWEST_AGREE = 5
-# What lies farther aside is no painting error: its label is wrong. Nothing changes from half to double.
+# Offset (m) above which a feature is not painted inaccurately, but has a wrong label. Nothing changes from half to
+# double.
 _FAR_M = 0.1
 
 
-# ---- observations that were taken out and may speak again -----------------------------------------------------------
+# ---- rejected observations that may take part again -----------------------------------------------------------------
 
 
 def _recalled(case: DiagnosisCase) -> Mask:
-    """(E,) which equations take part when lines and points that were taken out nearly whole may speak too.
+    """(E,) which equations take part when lines and points that were rejected nearly completely may do so, too.
 
-    A feature that lies aside is an outlier everywhere. Where more of its observations agree about one place of their
-    own than agree with the drawing, those take part instead.
+    A feature off its nominal position is an outlier everywhere. Where more of its observations agree on another
+    position than agree with the drawing, those take part instead.
     """
     equations, weight, used = case.equations, case.model.weight, case.model.used.copy()
     open_to_it = ~_mislabelled(case)[equations.observation]
@@ -251,7 +253,7 @@ def _recalled(case: DiagnosisCase) -> Mask:
 
 
 def _mislabelled(case: DiagnosisCase) -> Mask:
-    """(N + M,) the observations that a wrong label explains."""
+    """(N + M,) which observations a wrong label explains."""
     points = len(case.problem.observations.points)
     explained = np.zeros(len(case.table), dtype=bool)
     for label in case.labels:
@@ -260,7 +262,7 @@ def _mislabelled(case: DiagnosisCase) -> Mask:
 
 
 def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
-    """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
+    """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is large."""
     amount = least_absolute(columns, residual)
     _, of = np.unique(observation, return_inverse=True)
     lengths = np.sqrt(np.bincount(of, (residual + columns @ amount) ** 2))
@@ -271,10 +273,10 @@ def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigm
 
 
 def _with_newcomers_placed(problem: Problem, calibration: Calibration) -> Estimate:
-    """The calibration's estimate with every placement that is new among the observations in its best pose.
+    """Return the calibration's estimate with every new placement of the observations in its best pose.
 
     Raises:
-        DegenerateError: one of them cannot be posed: fewer than six points, or points in disagreement.
+        DegenerateError: a placement cannot be posed: it has fewer than six points, or its points disagree.
     """
     estimate = calibration.estimate
     new = frozenset(key.placement for key in problem.sights.keys if key.placement) - set(estimate.placements)

@@ -1,10 +1,10 @@
 """Wrong labels: observations that lie where another feature of the same target is than the one they are named after.
 
-Looked at are those that were taken out, and those beyond the ends of a curve that lies on one line with another: a
-solve, which knows no ends, fits them.
+Rejected observations are examined, and those beyond the ends of a curve that lies on one line with another curve: a
+solve, which does not use the ends, fits them.
 
-The false alarm is an outlier that happens to lie there. Its probability: the share of the image that lies as near to
-any other feature, for each observation; for several of one frame and label that fit one feature, the binomial tail.
+A false alarm is an outlier that lies there by chance. For one observation, the probability is the share of the image
+that is as close to any other feature; for several of one frame and label that fit one feature, the binomial tail.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ceres_cal.scene import Camera, Curve, Target, curve_points, nearest_to_rays
 
 
 class WrongLabel(Frozen):
-    """Observations of one view under one label that fit another.
+    """Observations of one view and one label that fit another feature.
 
     Attributes:
-        is_curve, view: of all of them. feature, instead: index of the label and of the feature that fits, among the
-            target's. rows: (K,) rows. distance_px: (K,) from the feature that fits.
-        log_p: of so many by chance.
+        is_curve, view: the same for all of them. feature, instead: indices of the label and of the feature that fits,
+            among the target's. rows: (K,) rows. distance_px: (K,) from the feature that fits.
+        log_p: natural logarithm of the probability of so many by chance.
     """
 
     is_curve: bool
@@ -47,12 +47,12 @@ def find_mislabelled(
     scales: tuple[float, float],
     reject_sigma: float,
 ) -> tuple[list[WrongLabel], int]:
-    """Every group of observations that another feature explains within the noise, and how many were looked at.
+    """Return every group of observations that another feature explains within the noise, and how many were examined.
 
     Args:
-        taking_part: of points (N,) and of curve observations (M,). scales: of the noise of either.
+        taking_part: (N,) of points and (M,) of curve observations. scales: noise scales of both.
     """
-    most = 20_000  # rejected observations looked at: of more, evenly spread ones
+    most = 20_000  # rejected observations examined: of more, evenly spread ones
     mislabelled: list[WrongLabel] = []
     tried = 0
 
@@ -96,7 +96,7 @@ class _Sight(Frozen):
         return np.where(np.isfinite(off), off, np.inf)
 
     def chance(self, is_curve: bool, distance_px: float) -> float:
-        """The share of the image that lies within a distance of any feature."""
+        """Return the share of the image that lies within a distance of any feature."""
         width, height = self.camera.image_size
         if not is_curve:
             return min(1.0, len(self.target.points) * np.pi * distance_px**2 / (width * height))
@@ -104,7 +104,7 @@ class _Sight(Frozen):
 
 
 def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Array) -> list[WrongLabel]:
-    """The groups of one view."""
+    """Return the groups of one view."""
     is_curve, named = isinstance(column, Curves), column.feature[rows]
     distance = sight.distances(column, rows)
     every = np.arange(len(rows))
@@ -119,7 +119,7 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
         chosen = fits & tried & (nearest == instead)
         under_it = np.count_nonzero((column.view == view) & (column.feature == label))
         if 2 * chosen.sum() <= under_it == (misses & tried).sum():
-            continue  # all of it lies elsewhere, and only crosses the other: a circle of another radius
+            continue  # the whole feature lies elsewhere, and only crosses the other: a circle of another radius
         near = sight.chance(is_curve, float(away[chosen].max()))
         log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
         groups.append(
@@ -131,7 +131,7 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
 
 
 def _may_lie_beyond(observations: Observations, column: Columns) -> Mask:
-    """(N,) observations of curves that lie on one line, or circle, with another of their target."""
+    """(N,) which observations are of curves that lie on one line, or circle, with another curve of their target."""
     beyond = np.zeros(len(column), dtype=bool)
     if isinstance(column, Curves):
         of_view = np.array([list(observations.targets).index(view.target) for view in observations.views])
@@ -144,13 +144,13 @@ def _may_lie_beyond(observations: Observations, column: Columns) -> Mask:
 
 
 def _shares_its_line(target: Target) -> Mask:
-    """(C,) curves that lie on one straight line, or one circle, with another."""
-    same_line = 1e-6  # m and rad, within which two curves lie on one line or circle
+    """(C,) which curves lie on one straight line, or one circle, with another."""
+    same_line = 1e-6  # tolerance, m and rad, for two curves on one line or circle
     tracks, is_arc = target.tracks[0], target.is_arc
     c, a = tracks[:, 0], tracks[:, 1]
     along = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12)
     between = c[:, None] - c
-    beside = np.linalg.norm(np.cross(along[:, None], between), axis=2)  # of a line: how far the other's start is off it
+    beside = np.linalg.norm(np.cross(along[:, None], between), axis=2)  # distance of the other's start from a line
     turned = np.linalg.norm(np.cross(along[:, None], along), axis=2)
     lines = (beside < same_line) & (turned < same_line) & ~is_arc[:, None] & ~is_arc
     size = np.linalg.norm(a, axis=1)
@@ -191,8 +191,8 @@ def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
 
 
 def renamings(observations: Observations, calibration: Calibration) -> Iterator[WrongLabel]:
-    """Features of the world all of whose observations in a view, its rows, lie where another feature does: two and
-    more of a curve, or two features that lie where each other's should.
+    """Yield features of the world whose observations in a view, its rows, all lie where another feature does: at least
+    two observations of a curve, or two features that are exchanged.
     """
     least_rows = 2  # of a feature that is renamed: one observation lies on some curve by chance
     judged = calibration.inlier_masks(observations), calibration.fit.scales, calibration.options.reject_sigma
@@ -207,7 +207,7 @@ def renamings(observations: Observations, calibration: Calibration) -> Iterator[
 
 
 def renaming_words(one: WrongLabel, observations: Observations) -> str:
-    """What was seen of a feature lies where another one does."""
+    """Return the sentence that a feature was observed where another one lies."""
     view = observations.views[one.view]
     target = observations.targets[view.target]
     kind, names = ("curve", target.curve_names) if one.is_curve else ("point", target.point_names)
@@ -220,7 +220,7 @@ def _rows_of(one: WrongLabel, observations: Observations) -> Indices:
 
 
 def _is_whole(one: WrongLabel, observations: Observations, calibration: Calibration) -> bool:
-    """Whether all that was seen of the feature lies where the other does: crossing it, some of that may fit both."""
+    """Return whether all observations of the feature lie where the other does; where they cross, some fit both."""
     view, rows = observations.views[one.view], _rows_of(one, observations)
     if view.placement is not None or 2 * len(one.rows) <= len(rows):
         return False
@@ -232,7 +232,7 @@ def _is_whole(one: WrongLabel, observations: Observations, calibration: Calibrat
 
 
 def mended(observations: Observations, wrong: Iterable[WrongLabel]) -> Observations:
-    """The observations with the right names."""
+    """Return the observations with the right names."""
     points, curves = observations.points.feature.copy(), observations.curves.feature.copy()
     for one in wrong:
         (curves if one.is_curve else points)[one.rows] = one.instead

@@ -12,19 +12,19 @@ from ceres_cal.effects import Case, Linearised
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
-"""Columns and rows of equal parts into which an image is divided."""
+"""Numbers of columns and rows of equal parts into which an image is divided."""
 RADIUS_BINS = 12
-"""Rings of equal width, from the principal point to the farthest corner."""
+"""Number of rings of equal width, from the principal point to the farthest corner."""
 
 
 class Summary(Frozen):
-    """Groups of observations, G of them.
+    """Statistics of G groups of observations.
 
     Attributes:
-        names: of the groups. points, curves: (G,) inliers. rejected: (G,) observations that were taken out.
+        names: of the groups. points, curves: (G,) numbers of inliers. rejected: (G,) numbers of outliers.
         points_rms_px: (G,) of the lengths of residual vectors. curves_rms_px: (G,) of the distances. rms_mm: (G,) of
             both on the targets' planes. rms_sigma: (G,) of both in their standard deviations, 1 where the noise is as
-            everywhere. NaN where a group has none. All of inliers.
+            everywhere. All are of inliers, and NaN where a group has none.
     """
 
     names: tuple[str, ...]
@@ -38,12 +38,12 @@ class Summary(Frozen):
 
 
 class RadiusTrend(Frozen):
-    """What the residuals do along the radius, of one camera, in RADIUS_BINS rings.
+    """Radial residuals of one camera, in RADIUS_BINS rings.
 
     Attributes:
-        radius_px: (B + 1,) edges of the rings. outward_px: (B,) the mean displacement of the model against the
-            observations away from the principal point, by least squares from points and curves; sd_px: (B,) its
-            standard deviation; NaN in a ring that nothing crosses.
+        radius_px: (B + 1,) edges of the rings. outward_px: (B,) mean displacement of the model from the observations,
+            away from the principal point, by least squares from points and curves; sd_px: (B,) its standard deviation;
+            NaN in a ring without observations.
     """
 
     camera: str
@@ -65,7 +65,7 @@ class Summaries(Frozen):
 
 
 def summarise(case: Case, table: ResidualTable) -> Summaries:
-    """All summaries of a table."""
+    """Return all summaries of a table."""
     observations, cameras = case.problem.observations, case.estimate.cameras
     several = len(observations.stations) > 1
     labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
@@ -85,7 +85,7 @@ def summarise(case: Case, table: ResidualTable) -> Summaries:
 
 
 def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
-    """Groups with any observation, in the order of their names."""
+    """Return the groups with any observation, in the order of their names."""
     size, inlier = len(names), table.inlier
     points, curves = inlier & ~table.is_curve, inlier & table.is_curve
 

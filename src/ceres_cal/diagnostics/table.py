@@ -1,4 +1,4 @@
-"""The residual table: one row per observation, in columns, under its permanent id."""
+"""The residual table: one row per observation, stored in columns, with its permanent id."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from ceres_cal.scene.camera import Camera
 
 INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3
 REASONS = ("", "too far off", "cannot be seen from there", "a copy of another")
-"""Why an observation was taken out, by its code in `ResidualTable.reason`."""
+"""Reasons why an observation was rejected, by its code in `ResidualTable.reason`."""
 _MEASURES = ("distance_px", "error_mm", "sigma_px", "scale", "weight", "leverage", "standardised", "radius_px")
-"""Columns that files have as they are."""
+"""Columns that files contain unchanged."""
 
 
 class ResidualTable(Frozen):
@@ -30,20 +30,22 @@ class ResidualTable(Frozen):
 
     Attributes:
         is_curve, row: (N,) the permanent id: kind and row of the observations' columns.
-        view: (N,) number of its view, which tells frame, camera, station, target and placement. views: those names.
-        feature: (N,) index into `features`, "target/name".
-        pixel: (N, 2) where it was observed, px. residual_px: (N, 2) model minus observation; of a curve observation to
-            the foot of the perpendicular. distance_px: (N,) its length; of a curve observation signed, positive where
-            the curve lies to the right of the observation as someone sees it who walks along the curve in the image.
-        error_mm: (N,) the same on the target's plane, by the local derivative of the projection: how far from its
-            feature the observation places it. NaN where the plane is seen edge-on.
-        sigma_px: (N,) stated; scale: (N,) estimated factor on it. weight: (N,) of the robust loss, 0 where taken out.
-        leverage: (N,) share of the observation that the fit took up, 0 to 1 (mean of a point's two equations); of one
-            that was taken out, the fit's own variance there over the noise's.
-        standardised: (N,) residual over its own standard deviation, in which the fit's share is counted: of a point
-            the length of two such numbers, of a curve observation signed.
-        radius_px: (N,) from the principal point, square pixels. reason: (N,) code of REASONS, 0 for an inlier.
-        What is unknown, because the calibration cannot show the observation, is NaN.
+            view: (N,) index into `views`, each with the names of frame, camera, station, target and placement.
+            feature: (N,) index into `features`, "target/name".
+            pixel: (N, 2) where it was observed, px. residual_px: (N, 2) model minus observation; of a curve observation
+                to the foot of the perpendicular. distance_px: (N,) its length; of a curve observation signed, positive
+                where the curve is on the right of the observation for somebody who walks along the curve in the image.
+            error_mm: (N,) the same on the target's plane, by the local derivative of the projection: distance from its
+                feature to where the observation places it. NaN where the plane is seen edge-on.
+            sigma_px: (N,) stated; scale: (N,) estimated factor on it. weight: (N,) of the robust loss, 0 where
+                rejected.
+            leverage: (N,) share of the observation that the fit absorbed, 0 to 1 (mean of a point's two equations); of
+                a rejected one, the fit's own variance there over the noise's.
+            standardised: (N,) residual over its own standard deviation, which is reduced by the fit's share: of a point
+                the length of two such numbers, of a curve observation signed.
+            radius_px: (N,) from the principal point, square pixels. reason: (N,) code of REASONS, 0 for an inlier.
+
+        Values are NaN where the calibration cannot show the observation.
     """
 
     is_curve: Mask
@@ -75,15 +77,15 @@ class ResidualTable(Frozen):
 
     @property
     def outlier(self) -> Mask:
-        """(N,) what was taken out for its residual; copies of other observations were taken out, too."""
+        """(N,) observations that were rejected for their residuals; copies of others were rejected, too."""
         return np.asarray((self.reason == TOO_FAR) | (self.reason == NOT_SEEN))
 
     def id_of(self, number: int) -> str:
-        """How messages name an observation: "point 17" or "curve 4"."""
+        """Return the name of an observation in messages: "point 17" or "curve 4"."""
         return f"{'curve' if self.is_curve[number] else 'point'} {self.row[number]}"
 
     def columns(self) -> dict[str, AnyArray]:
-        """Every column as a flat array under its name in the exported files, names written out."""
+        """Return every column as a flat array, by its name in the exported files, with names written out."""
         views = {
             name: np.array([view[name] or "" for view in self.views], dtype=np.str_)[self.view]
             for name in ("frame", "camera", "station", "target", "placement")
@@ -102,7 +104,7 @@ class ResidualTable(Frozen):
         }
 
     def save(self, path: Path) -> None:
-        """Write as .csv, .json or .npz (columns, all three); numbers keep every digit, NaN is empty or null in text.
+        """Write columns as .csv, .json or .npz; numbers keep every digit, NaN is empty or null in text.
 
         Raises:
             InputError: another ending, or the file cannot be written.
@@ -134,7 +136,7 @@ def _plain(column: AnyArray) -> list[Any]:
 
 
 def make_table(inliers: Inliers, model: Linearised, weight: Array, cameras: Mapping[str, Camera]) -> ResidualTable:
-    """The table of all observations.
+    """Return the table of all observations.
 
     Args:
         weight: (E,) robust weight of each equation's observation.
@@ -176,7 +178,7 @@ def make_table(inliers: Inliers, model: Linearised, weight: Array, cameras: Mapp
 
 
 def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Indices]:
-    """All features as "target/name", points of all targets first, and where each target's points and curves begin."""
+    """Return all features as "target/name", points of all targets first, and where each target's begin."""
     targets = observations.targets
     points = [f"{name}/{point}" for name, target in targets.items() for point in target.point_names]
     curves = [f"{name}/{curve}" for name, target in targets.items() for curve in target.curve_names]
@@ -186,14 +188,14 @@ def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Indices
 
 
 def _spread_out(equations: Equations, values: Array, count: int) -> Array:
-    """(N,) a value of each equation at its observation, the second of a point's two; NaN where there is none."""
+    """(N,) value of each equation at its observation, of a point's two the second; NaN where there is none."""
     column = np.full(count, np.nan)
     column[equations.observation] = values
     return column
 
 
 def error_mm(equations: Equations, values: Array, count: int) -> Array:
-    """(N,) mm on the target's plane that displacements (E,) px in the image stand for; of a curve signed, else lengths.
+    """(N,) mm on the target's plane by displacements (E,) px in the image; of a curve signed, else lengths.
 
     NaN where there is no equation, or where the plane is seen edge-on.
     """

@@ -165,11 +165,11 @@ class Posterior(Frozen):
         return how(information.less(stated)) + stated
 
     def again(self, added: Information) -> Information:
-        """What more observations of the same kind add to the information: they average out what varies from one to the
-        next, which is what the model alone says, and not what widens it.
+        """Return what more observations of the same kind add to the information: they average out the noise that varies
+        from one to the next, by the model alone, but not what widens the posterior.
 
         Args:
-            added: about all of the numbers, were it all that there is to know.
+            added: about all of the numbers, from these observations by themselves.
         """
         if self.by_model is None:
             return added

@@ -1,4 +1,4 @@
-"""What stands in the room: lenses, cameras, targets of known geometry."""
+"""The scene: lenses, cameras, and targets of known geometry."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -22,18 +22,19 @@ from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.base.typed import numbers_in, rows, size_in
 from ceres_cal.scene.lens import Lens, make_lens
 
-LARGEST_PX = 10**9  # what is larger is no number of pixels
-LARGEST = 1e100  # of any number of a camera: squares and cubes of what is larger overflow
-_FOREIGN = "ceres_cal.scene.foreign"  # above: it is loaded when somebody asks for a camera in the words of others
+LARGEST_PX = 10**9  # larger values are no numbers of pixels
+LARGEST = 1e100  # upper limit of a camera's numbers: squares and cubes of larger ones overflow
+_FOREIGN = "ceres_cal.scene.foreign"  # it imports this module, so it is loaded when it is needed
 
 
 class OpenCvCamera(Struct, frozen=True, eq=False):
-    """A camera as OpenCV's functions take it: `K, dist, rvec, tvec = camera.to_opencv()`.
+    """A camera in the form that OpenCV's functions take: `K, dist, rvec, tvec = camera.to_opencv()`.
 
     Attributes:
-        matrix: K (3, 3). distortion: its coefficients. rvec, tvec: (3,) from the world, metres.
-        fisheye: whether they are those of `cv2.fisheye`.
-        error_px: root mean square and largest distance over the image from the camera that it was made of.
+        matrix: K (3, 3). distortion: its coefficients. rvec, tvec: (3,) pose, from the world to the camera; tvec in
+            metres.
+        fisheye: whether the coefficients are those of `cv2.fisheye`.
+        error_px: root mean square and largest distance over the image from the original camera.
     """
 
     matrix: Array
@@ -110,7 +111,7 @@ class Camera(Frozen, eq=True):
 
     @property
     def position(self) -> Array:
-        """Where the camera is in the world, (3,) metres: the paper's t. Its third number is the height."""
+        """Position of the camera in the world, (3,) metres: the paper's t. Its third number is the height."""
         return self.cam_from_world.position
 
     @property
@@ -136,12 +137,12 @@ class Camera(Frozen, eq=True):
 
     @property
     def _edge(self) -> Array:
-        """(N, 2) offsets of places along the image's edge, its corners among them."""
+        """(N, 2) offsets of places along the image's edge, including its corners."""
         return self.offsets(_along_edge(self.image_size))
 
     @property
     def folds(self) -> bool:
-        """Whether the lens stops being monotone inside the image, so that some pixels have no single answer."""
+        """Whether the lens stops being monotone inside the image, so that some pixels have no unique ray."""
         return not np.all(self.lens.shows(self._edge, self.phi))
 
     def require_monotone(self, name: str) -> None:
@@ -183,15 +184,15 @@ class Camera(Frozen, eq=True):
         """Pixels (N, 2), or one (2,), -> where their rays meet the plane z = height_m, (N, 2) or (2,) m (paper,
         sections 3.4 and 4).
 
-        NaN for a ray that does not meet the plane in front of the camera. How well the answer is known the number does
-        not tell: see the calibration's uncertainty.
+        NaN for a ray that does not meet the plane in front of the camera. For the accuracy of the place see the
+        calibration's uncertainty.
 
         Raises:
-            InputError: a height far over the camera: it is one in metres.
+            InputError: a height far above the camera, which is probably in millimetres: heights are in metres.
         """
         if not isinstance(height_m, Real):
             raise InputError(f"height_m must be a number of metres, such as 0.15, not {height_m!r}")
-        far_m = 10.0  # a height of as many metres, far over its camera, is one in millimetres
+        far_m = 10.0  # a height above this, and far above the camera, is in millimetres
         if abs(height_m) > max(far_m, 2.0 * abs(self.position[2])):
             raise InputError(
                 f"height_m {height_m:g} is in metres, and the camera's is {self.position[2]:.2f}: "
@@ -227,10 +228,10 @@ class Camera(Frozen, eq=True):
     def undistort_maps(
         self, matrix: ArrayLike | None = None, size: tuple[int, int] | None = None
     ) -> tuple[Array32, Array32]:
-        """map_x, map_y (height, width) for `cv2.remap`, of whatever lens; NaN where it has no answer.
+        """Return map_x, map_y (height, width) for `cv2.remap`, for any lens; NaN where it has no answer.
 
         Args:
-            matrix: K (3, 3) of the straight image, by default the camera's own. size: (width, height), too.
+            matrix: K (3, 3) of the straight image, by default the camera's own. size: its (width, height), likewise.
         """
         inverse = np.linalg.inv(self.matrix if matrix is None else numbers_in(matrix, "matrix"))
         width, height = size_in(size or self.image_size, "size")
@@ -238,11 +239,11 @@ class Camera(Frozen, eq=True):
         places = self.at(Pose.identity()).project(pixels.reshape(-1, 3) @ inverse.T).reshape(height, width, 2)
         return places[..., 0].astype(np.float32), places[..., 1].astype(np.float32)
 
-    # ---- in the words of others --------------------------------------------------------------------------------------
+    # ---- in the form of other programs -------------------------------------------------------------------------------
 
     def to_opencv(self) -> OpenCvCamera:
-        """K, coefficients, rvec and tvec as OpenCV takes them; where it does not have the lens, or for a skew, the best
-        fit, with its error.
+        """Return K, coefficients, rvec and tvec for OpenCV. They are the best fit, with its error, where OpenCV does
+        not have the lens, or where there is a skew.
         """
         camera: OpenCvCamera = import_module(_FOREIGN).to_opencv(self)
         return camera
@@ -258,10 +259,10 @@ class Camera(Frozen, eq=True):
         *,
         fisheye: bool = False,
     ) -> Camera:
-        """A camera from OpenCV's numbers: `brown`, or `kannala-brandt` of those of its fisheye model.
+        """Return a camera from OpenCV's numbers: `brown`, or `kannala-brandt` from those of its fisheye model.
 
         Raises:
-            InputError: numbers that make no camera.
+            InputError: the numbers make no camera.
         """
         others = import_module(_FOREIGN)
         vectors = (numbers_in(one, name).ravel() for one, name in ((rvec, "rvec"), (tvec, "tvec")))
@@ -296,7 +297,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 class LensFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A lens; only `radial` and `spline` have powers. Which terms it has, its coefficients' names say."""
+    """A lens; only `radial` and `spline` have powers. The names of its coefficients say which terms it has."""
 
     kind: str
     powers: tuple[int, ...] | None = None
@@ -313,11 +314,11 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     skew: float | msgspec.UnsetType = msgspec.UNSET
     lens: LensFile
     camera_matrix: Matrix | msgspec.UnsetType = msgspec.UNSET
-    """K, for other programs: phi, aspect, skew and principal point once more."""
+    """K, for other programs; redundant with phi, aspect, skew and principal point."""
 
     @classmethod
     def of(cls, camera: Camera) -> CameraFile:
-        """As a file has it."""
+        """Return a camera in the form of a file."""
         lens = LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients)
         size, centre = camera.image_size, camera.principal_point
         k = camera.matrix.tolist()
@@ -332,7 +333,7 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         )
 
     def camera(self) -> Camera:
-        """The camera, at no particular pose; InputError where it is none."""
+        """Return the camera, without a particular pose; raise InputError where it is invalid."""
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
         camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect, skew=self.skew or 0.0)
         if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
@@ -348,14 +349,14 @@ class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, pose: Pose) -> PoseFile:
-        """As a file has it."""
+        """Return a pose in the form of a file."""
         return cls(pose.rotation.tolist(), pose.translation.tolist())
 
     def pose(self) -> Pose:
-        """The pose; InputError where the rotation is none."""
+        """Return the pose; raise InputError where the rotation is invalid."""
         return Pose(require_rotation(self.rotation, "rotation"), np.array(self.translation_m))
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """A camera's intrinsics as plain data."""
+    """Return a camera's intrinsics as plain data."""
     return dict(msgspec.to_builtins(CameraFile.of(camera)))

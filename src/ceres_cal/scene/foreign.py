@@ -1,7 +1,7 @@
-"""A camera as other programs describe it: K, a lens model of theirs with its coefficients, and a pose.
+"""A camera as other programs describe it: K, their lens model with its coefficients, and a pose.
 
-Where one of our lenses is their model, both ways are exact. Elsewhere the best fit over the image is taken, and says by
-how much it misses: `error_px`.
+Where their model is one of our lenses, both directions are exact. Otherwise the best fit over the image is used, and
+`error_px` says how far it is off.
 """
 
 from __future__ import annotations
@@ -18,34 +18,34 @@ from ceres_cal.scene.camera import LARGEST, LARGEST_PX, Camera, OpenCvCamera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, make_lens
 
 OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
-"""How many coefficients there are of OpenCV's, in its order: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]."""
+"""Number of coefficients of OpenCV's models, in its order: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]."""
 FISHEYE = "fisheye"
 """OpenCV's fisheye model: k1 to k4."""
 THIN_PRISM_FISHEYE = "THIN_PRISM_FISHEYE"
-"""COLMAP's: a fisheye with decentring and a thin prism."""
+"""COLMAP's model: a fisheye with decentring and a thin prism."""
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 _NAMES = {
     **{model: (Brown.kind, _OPENCV[:count]) for model, count in OPENCV_MODELS.items()},
     FISHEYE: (KannalaBrandt.kind, KannalaBrandt.above),
     THIN_PRISM_FISHEYE: (KannalaBrandt.kind, ("k1", "k2", "p1", "p2", "k3", "k4", "", "")),
 }
-"""Model -> the kind of our lenses that it is, and the names of its coefficients there; "" of those that none has."""
-_FISHEYES = (FISHEYE, THIN_PRISM_FISHEYE)  # models of angles, which show what is across, too
+"""Model -> the kind of our lenses that it is, and the names of its coefficients there; "" where we have none."""
+_FISHEYES = (FISHEYE, THIN_PRISM_FISHEYE)  # models of angles, which also show rays across the axis
 TO_HOLD = ("opencv12", THIN_PRISM_FISHEYE)
-"""Models for lenses that they hold exactly: no other lens is fitted by them."""
-_GRID = (41, 31)  # pixels of the image over which a fit is made
+"""Models that are only used for lenses that they hold exactly: no other lens is fitted by them."""
+_GRID = (41, 31)  # of pixels of the image over which a fit is made
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
 
 
 class ForeignCamera(Frozen):
-    """A camera in the words of others.
+    """A camera in the form of another program.
 
     Attributes:
         image_size: (width, height) px. focal: fx, fy. centre: cx, cy, with (0, 0) at the centre of the first pixel.
-        model: one of OPENCV_MODELS, FISHEYE, or a name that only its own program knows. coefficients: of it.
+        model: one of OPENCV_MODELS, FISHEYE, or a name that only its own program knows. coefficients: of the model.
         cam_from_world: None where the file has none.
-        error_px: root mean square and largest distance, over the image, from the camera that it is the best fit to.
-        distort: of a model that is not known here, rays (N, 3) -> measured places (N, 2) at focal length 1.
+        error_px: root mean square and largest distance, over the image, from the camera to which it was fitted.
+        distort: for a model that is not known here, rays (N, 3) -> measured places (N, 2) at focal length 1.
     """
 
     image_size: tuple[int, int]
@@ -84,7 +84,7 @@ class ForeignCamera(Frozen):
         *,
         fisheye: bool = False,
     ) -> ForeignCamera:
-        """Of OpenCV's K (3, 3) and coefficients: 0, 1, 4, 5, 8, 12 or 14 of them, or the four of its fisheye.
+        """Return a camera from OpenCV's K (3, 3) and 0, 4, 5, 8, 12 or 14 coefficients, or the four of its fisheye.
 
         Raises:
             InputError: another number of coefficients, a skew, or a sensor that is tilted in its camera.
@@ -107,8 +107,8 @@ class ForeignCamera(Frozen):
 
     @classmethod
     def of(cls, camera: Camera, *models: str) -> ForeignCamera:
-        """A camera of ours in one of these models: exactly where one holds its lens, else as the best fit over the
-        image.
+        """Return a camera of ours in one of these models: exactly where one holds its lens, else as the best fit over
+        the image.
         """
         blanks = []
         for model in models:
@@ -122,7 +122,7 @@ class ForeignCamera(Frozen):
         rays = camera.rays(pixels)
         known, ahead = np.isfinite(rays[:, 0]), _ahead(rays)
         fits = [cls.fitted(blank, rays[known], pixels[known]) for blank in blanks]
-        # Most models show nothing across or behind: they are told apart by the rest.
+        # Most models cannot show rays across the axis or behind it: they are compared by the others.
         return min(fits, key=lambda fit: _error(fit.project_rays(rays[ahead]), pixels[ahead])[0])
 
     @property
@@ -137,7 +137,7 @@ class ForeignCamera(Frozen):
 
     @property
     def lens(self) -> Lens | None:
-        """Ours that is the same; None where none is."""
+        """The same lens of ours; None where there is none."""
         if self.model not in _NAMES:
             return None
         kind, names = _NAMES[self.model]
@@ -146,7 +146,7 @@ class ForeignCamera(Frozen):
 
     @staticmethod
     def coefficients_of(lens: Lens, model: str) -> tuple[float, ...] | None:
-        """A lens of ours in the numbers of a model; None where that does not hold it."""
+        """Return the coefficients of a lens of ours in a model; None where the model does not hold it."""
         kind, names = _NAMES[model]
         given = {name: value for name, value in lens.coefficients.items() if value != 0.0}
         if lens.kind != kind or not set(given) <= set(names):
@@ -168,7 +168,7 @@ class ForeignCamera(Frozen):
 
     @classmethod
     def fitted(cls, start: ForeignCamera, rays: Array, pixels: Array) -> ForeignCamera:
-        """The camera of the start's model that shows rays (N, 3) nearest to pixels (N, 2)."""
+        """Return the camera of the start's model that shows rays (N, 3) closest to pixels (N, 2)."""
         count = len(start.coefficients)
         numbers = np.array([*start.focal, *start.centre, *start.coefficients])
         sizes = np.array([start.focal[0]] * 2 + [start.focal[0]] * 2 + [1.0] * count)
@@ -187,11 +187,11 @@ class ForeignCamera(Frozen):
 
     @np.errstate(over="ignore", invalid="ignore")  # where it shows nothing
     def camera(self) -> tuple[Camera, tuple[float, float]]:
-        """The camera as ours, and by how much that misses it over the image: root mean square and largest distance,
-        px, 0 where the lens is one of ours.
+        """Return the camera as ours, and how far that is off over the image: root mean square and largest distance, px,
+        0 where the lens is one of ours.
 
         Raises:
-            InputError: it shows nothing of its image.
+            InputError: it shows nothing of its image, or no lens of ours is near it.
         """
         pose, lens, (fx, fy) = self.pose, self.lens, self.focal
         if lens is not None:
@@ -233,7 +233,7 @@ def _error(pixels: Array, wanted: Array) -> tuple[float, float]:
 
 def _all_directions() -> Array:
     """(directions, angles, 3) rays from the axis outwards to 89 degrees."""
-    angles, directions = 120, 24  # of rays in all directions, to see what a foreign model shows
+    angles, directions = 120, 24  # numbers of rays, to see what a foreign model shows
     angle = np.radians(np.linspace(0.0, 89.0, angles))
     turn = np.linspace(0.0, 2.0 * np.pi, directions, endpoint=False)[:, None]
     across = np.sin(angle)
@@ -244,8 +244,8 @@ def _all_directions() -> Array:
 def lens_fitted(
     foreign: ForeignCamera, lens: Lens, rays: Array, pixels: Array
 ) -> tuple[Camera, tuple[float, float]] | None:
-    """The camera with a lens of ours that is nearest to a foreign one, and by how much it misses that; None where it
-    has no answer for some of what that shows.
+    """Return the camera with a lens of ours that is closest to a foreign one, and how far it is off; None where it has
+    no answer for some of what the foreign one shows.
     """
     unit = 0.5 * float(np.hypot(*foreign.image_size))
     scales = lens.scales(unit)
@@ -273,7 +273,7 @@ def lens_fitted(
 
 
 def nearest(camera: Camera, lens: Lens) -> Camera:
-    """A camera with another lens, its coefficients and the other intrinsics fitted over the image.
+    """Return a camera with another lens, with its coefficients and the other intrinsics fitted over the image.
 
     Raises:
         InputError: that lens would fold inside the image.
@@ -291,7 +291,7 @@ def nearest(camera: Camera, lens: Lens) -> Camera:
 
 
 def opencv_models(camera: Camera) -> tuple[str, ...]:
-    """Those of OpenCV's models that may come near a camera: its fisheye where that is our lens, or sees across."""
+    """Return OpenCV's models that may fit a camera: its fisheye where that is our lens or rays across are seen."""
     is_one = ForeignCamera.coefficients_of(camera.lens, FISHEYE) is not None
     rays = camera.rays(image_grid(camera.image_size))
     fisheye = is_one or bool(np.any(np.isfinite(rays[:, 0]) & ~_ahead(rays)))
@@ -299,13 +299,13 @@ def opencv_models(camera: Camera) -> tuple[str, ...]:
 
 
 def _ahead(rays: Array) -> Mask:
-    """(N,) unit rays that models of tangents can show: beside shallower ones these grow beyond all functions."""
+    """(N,) which unit rays models of tangents can show: the tangents of shallower ones grow beyond all functions."""
     shallowest = 0.1
     return np.asarray(rays[:, 2] > shallowest)
 
 
 def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> Array:
-    """(N, 2) pixels evenly over an image, to its very edges."""
+    """(N, 2) pixels evenly over an image, up to its edges."""
     return grid_places(*(np.linspace(-0.5, size - 0.5, count) for size, count in zip(image_size, steps, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""What to measure next: each candidate with what it would take off a station's map, from the posterior."""
+"""What to measure next: candidates, each with its reduction of the errors of a station's map, from the posterior."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -1,4 +1,4 @@
-"""What could be measured next, the best of each kind searched for: heights, poles, boards, lines, frames."""
+"""Possible next measurements, with a search for the best of each kind: heights, poles, boards, lines, frames."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from ceres_cal.scene import Arc, Camera, Target, checkerboard, curve_points, cus
 from ceres_cal.simulate import Scene, ViewPlan, board_pose, simulate, well_inside
 
 POLE_M, POLE_SIGMA_M = 1.0, 0.005
-"""Height of a pole, and how far its top may stand aside from where it should, along x and along y."""
+"""Height of a pole, and standard deviation of its top's position along x and along y, m."""
 BOARD = checkerboard(9, 6, 0.1)
 _FRAMES = 10
 _LINE_SPACING_M, _FRAME_SPACING_M = 0.05, 0.1
-# A marked place does for a pole where another one leaves not much less: nobody measures a place to save a tenth.
-# Nothing changes from half to double.
+# Ratio of the remaining errors up to which a marked place is preferred for a pole: nobody measures a place to save a
+# tenth. Nothing changes from half to double.
 _MARKED = 1.1
 _NEARER = ("upper", "right", "lower", "left")  # the edge that leans towards the camera, by quarter turns
 
 
 class Measurement(Frozen):
-    """What to measure besides what was observed.
+    """A measurement in addition to what was observed.
 
     Attributes:
         kind: "tape", "pole", "board", "line" or "frames".
         words: one line that says what to do. steps: one line for each part of it, where it has parts.
-        priors: what would be known of a station. Their values are the estimate's: what counts is the sigma.
-        targets, tolerances: what is brought along and how exactly it stands where it should.
-        placements: world_from_target. views: what the frames taken then would show.
+        priors: what would be known of a station. Their values are the estimate's: only the sigmas matter.
+        targets, tolerances: targets that are added, and how exactly they stand in place.
+        placements: world_from_target. views: what the additional frames would show.
     """
 
     kind: str
@@ -49,17 +49,17 @@ class Measurement(Frozen):
 
     @property
     def is_seen_again(self) -> bool:
-        """Whether it observes nothing but what the calibration did, from the same place."""
+        """Whether it only repeats observations of the calibration, from the same place."""
         return bool(self.views) and not self.targets
 
     def before(self, cam_from_world: Pose, other: Pose) -> Measurement:
-        """The same with every placement as far before a camera at another pose as it is before one at this."""
+        """Return a copy whose placements are before a camera at another pose as these are before one at this pose."""
         moved = other.inverse @ cam_from_world
         return replace(self, placements={name: moved @ pose for name, pose in self.placements.items()})
 
 
 def together(parts: Sequence[Measurement], words: str) -> Measurement:
-    """Several measurements of one kind as one; their names must differ."""
+    """Combine several measurements of one kind; their names must differ."""
     return Measurement(
         parts[0].kind,
         words,
@@ -76,8 +76,8 @@ class Ground(Frozen):
     """What a measurement would add to.
 
     Attributes:
-        estimate: where everything is thought to be. keys: (P) its free numbers. targets: as drawn.
-        tolerances: those it was calibrated with. weighting: noise, px, of points and of curves, and the loss.
+        estimate: of everything. keys: (P) its free numbers. targets: as drawn.
+        tolerances: those of the calibration. weighting: noise, px, of points and of curves, and the loss.
     """
 
     estimate: Estimate
@@ -87,18 +87,18 @@ class Ground(Frozen):
     weighting: Weighting
 
     def information_of(self, measurement: Measurement) -> Information:
-        """What a measurement would say of the free numbers, its own unknowns integrated out.
+        """Return the information of a measurement about the free numbers, with its own unknowns integrated out.
 
-        A placement is one of those, and so is how far a pole stands aside. It is nothing where the camera sees nothing,
-        or cannot project what it sees. Tolerances that the calibration had already are no news.
+        Its unknowns include placements and the offset of a pole. The information is zero where the camera sees nothing,
+        or cannot project what it sees. Tolerances that the calibration had already add nothing.
         """
         try:
             return self._told_by(measurement)
-        except (InputError, SolutionError):  # quiet: what tells nothing ranks last
+        except (InputError, SolutionError):  # quiet: a measurement without information ranks last
             return Information.nothing(self.keys)
 
     def _told_by(self, measurement: Measurement) -> Information:
-        """The same; raises where nothing is told."""
+        """Like `information_of`, but raises where there is no information."""
         targets = {**self.targets, **measurement.targets}
         estimate = self._with(measurement, targets)
         observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
@@ -106,18 +106,18 @@ class Ground(Frozen):
             gather_sights(observations, predicted=True),
             layout_of(self.keys, estimate, measurement.placements),
         )
-        if len(sights):  # of the hundreds of nodes of a surface a measurement sees a few
+        if len(sights):  # a measurement sees few of the hundreds of nodes of a surface
             seen = np.any(equations_of(sights, estimate, residuals(sights, estimate)).intrinsics != 0.0, axis=0)
             layout = replace(layout, free={name: own[seen[own]] for name, own in layout.free.items()})
         lenses = {name: camera.lens for name, camera in estimate.cameras.items()}
         stated = (stated_prior(prior, lenses[estimate.stations[prior.name].camera]) for prior in measurement.priors)
         priors = (*stated, *tolerances(estimate.structure, self.keys))
         told = information(Problem(sights, layout, priors, self.weighting), estimate)
-        whole = told.points.beside_all([told.curves, told.stated, told.built])  # how smooth a lens is, is known already
+        whole = told.points.beside_all([told.curves, told.stated, told.built])  # a lens's smoothness is known already
         return whole.marginal(whole.among(self.keys)).over(self.keys)
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
-        """The estimate with what the measurement brings along; of the placements those that are still free."""
+        """Return the estimate with what the measurement adds; of the placements only those that are still free."""
         solved = tuple(self.estimate.structure.dimensions)
         structure = make_structure(targets, {**self.tolerances, **measurement.tolerances}, solved)
         shared = dict.fromkeys(key.owner for key in self.keys if key.kind == "placement")
@@ -129,13 +129,13 @@ class Ground(Frozen):
 
 
 def news(measurement: Measurement, ground: Ground, outlook: Outlook) -> Information:
-    """What a measurement would add to what is known: of what was observed already, that noise is averaged out."""
+    """Return the information that a measurement adds to the posterior; repeated observations only average out noise."""
     told = ground.information_of(measurement)
     return outlook.posterior.again(told) if measurement.is_seen_again else told
 
 
 def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:
-    """What the views would show where everything is as estimated, without noise, in units of sigma 1."""
+    """Return what the views would show with everything as estimated, without noise, in units of sigma 1."""
     if not views:
         return Observations(targets, {}, (), NO_POINTS, NO_CURVES)
     stations = {plan.station: estimate.stations[plan.station] for plan in views}
@@ -147,10 +147,10 @@ def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[Vi
 
 
 class CandidateSearch(Frozen):
-    """Where the best of each kind is looked for.
+    """The search for the best measurement of each kind.
 
     Attributes:
-        board: the board that would be shown, under its name.
+        board: the board that would be shown, with its name.
     """
 
     ground: Ground
@@ -167,7 +167,7 @@ class CandidateSearch(Frozen):
         return self.ground.estimate.camera_at(self.station)
 
     def candidates(self) -> Iterator[Measurement]:
-        """The least work first."""
+        """Yield the candidates, those with the least work first."""
         pole_counts, board_counts, line_counts = (1, 3), (3, 6), (1, 3)
         yield from heights(self.station, self.camera)
         yield from self._best(poles(self), pole_counts, _poles_words, _marked_first)
@@ -182,7 +182,7 @@ class CandidateSearch(Frozen):
         words: Callable[[Sequence[Measurement]], str],
         choose: Callable[[Sequence[Measurement], Array], int] = lambda pool, worst: int(np.argmin(worst)),
     ) -> Iterator[Measurement]:
-        """Of a pool the best ones, each the one that brings most beside those before it."""
+        """Yield the best ones of a pool, in these counts; each adds most beside those before it."""
         left = list(pool)
         informations = [news(measurement, self.ground, self.outlook) for measurement in left]
         taken: list[Measurement] = []
@@ -206,7 +206,7 @@ class CandidateSearch(Frozen):
 
 
 def heights(station: str, camera: Camera) -> Iterator[Measurement]:
-    """The height, or the whole position, by tape."""
+    """Yield measurements of the height, or of the whole position, by tape."""
     position_sigma_m = 0.01
     height_sigmas_m = (0.02, 0.01, 0.005)
     x, y, height = camera.position.tolist()
@@ -222,14 +222,15 @@ def heights(station: str, camera: Camera) -> Iterator[Measurement]:
 
 
 def poles(search: CandidateSearch) -> Iterator[Measurement]:
-    """A pole at each place of a grid over the field, and on each of its marked points, where its top is seen.
+    """Yield a pole at each place of a grid over the field, and on each of its marked points, where its top is visible.
 
-    Where phi is followed along its profile, that is wherever the camera may be by it, if not hardly over the pole.
+    Where phi is followed along its profile, it must be visible from each pose that the camera may have, except for
+    those that are hardly above the pole.
     """
     most, step_m = 12, 0.5  # places along the longer side, on full steps
     camera, grid = search.camera, search.outlook.today
     grid_m = step_m * np.ceil(max(np.ptp(grid.x_m), np.ptp(grid.y_m)) / (most * step_m))
-    top = min(POLE_M, float(np.floor(4.0 * camera.position[2]) / 10.0))  # a short one under a low camera
+    top = min(POLE_M, float(np.floor(4.0 * camera.position[2]) / 10.0))  # shorter under a low camera
     elsewhere = [estimate.camera_at(search.station) for _, estimate in search.outlook.possible]
     cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]
     x, y = (np.arange(np.ceil(a[0] / grid_m), a[-1] / grid_m + 1e-9) * grid_m for a in (grid.x_m, grid.y_m))
@@ -255,7 +256,7 @@ def _pole(station: str, mark: str, x: float, y: float, top: float) -> Measuremen
 
 
 def _marked_first(pool: Sequence[Measurement], worst_mm: Array) -> int:
-    """The best place, or a marked one that is nearly as good: nobody has to measure where that is."""
+    """Return the best place, or a marked one that is nearly as good: nobody has to measure its position."""
     marked = np.array([measurement.words.startswith("on ") for measurement in pool])
     near = marked & (worst_mm <= _MARKED * np.min(worst_mm))
     return int(np.argmin(np.where(near, worst_mm, np.inf))) if near.any() else int(np.argmin(worst_mm))
@@ -270,7 +271,7 @@ def _poles_words(taken: Sequence[Measurement]) -> str:
 
 
 def boards(search: CandidateSearch) -> Iterator[Measurement]:
-    """The board at several places of the image, distances and tilts, where it is seen whole and over the floor."""
+    """Yield the board at several places of the image, distances and tilts, where it is visible and above the floor."""
     least_height_m = 0.05  # of any corner of a board over the floor
     board_tilts_deg = (20.0, 40.0)
     board_places = (0.2, 0.5, 0.8)  # of the image's width and height
@@ -310,7 +311,7 @@ def boards(search: CandidateSearch) -> Iterator[Measurement]:
 
 
 def lines(search: CandidateSearch) -> Iterator[Measurement]:
-    """Each curve of the field that the image shows, observed densely in one more frame."""
+    """Yield each curve of the field that the image shows, observed densely in one more frame."""
     for name, target in still(search.ground.targets).items():
         for curve in target.curves:
             stretch = _seen_stretch(search, target, curve)
@@ -320,7 +321,7 @@ def lines(search: CandidateSearch) -> Iterator[Measurement]:
 
 
 def _seen_stretch(search: CandidateSearch, target: Target, name: str) -> str | None:
-    """What of a curve the image shows, in words; None where it shows none of it."""
+    """Return in words which stretch of a curve the image shows; None where it shows none."""
     fine = 199  # pieces of a curve, to tell which stretch is seen
     curve = target.curves[name]
     places = curve_points(curve, 0, fine)
@@ -340,7 +341,7 @@ def _lines_words(taken: Sequence[Measurement]) -> str:
 
 
 def frames(search: CandidateSearch) -> Iterator[Measurement]:
-    """More frames of the field, as it was observed: its curves, or its points where no curves were."""
+    """Yield more frames of the field, as it was observed: its curves, or its points where no curves were."""
     names = tuple(f"advised_{number:02d}" for number in range(1, _FRAMES + 1))
     for name, target in still(search.ground.targets).items():
         if search.curves_observed and target.curves:

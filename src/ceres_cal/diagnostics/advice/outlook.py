@@ -1,4 +1,4 @@
-"""What a station's map would be if more were known: the worst and the mean error, in mm, at one height."""
+"""A station's map if more were known: the worst and the mean error, in mm, at one height."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, even
 from ceres_cal.posterior import FieldMap, Mixture, Posterior, locate_slopes, station_keys, visible_pixels
 from ceres_cal.problem import Estimate, Information, Key, moved
 
-BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`posterior.assess` leaves it there)
+BENT = 0.05  # relative sigma of phi up to which the quadratic model holds; `posterior.assess` follows phi beyond it
 
 
 class Errors(Frozen):
@@ -21,11 +21,11 @@ class Errors(Frozen):
 
 
 class Outlook(Frozen):
-    """One station at one height.
+    """The map of one station at one height.
 
     Attributes:
-        today: its map. keys: (K) the posterior's own that it depends on. slopes: (N, 2, K) by them of where the N
-            places that the image shows are located.
+        today: its map now. keys: (K) of the posterior on which it depends. slopes: (N, 2, K) derivatives by these of
+            the N places that the image shows.
     """
 
     estimate: Estimate
@@ -36,7 +36,7 @@ class Outlook(Frozen):
 
     @classmethod
     def of(cls, estimate: Estimate, posterior: Posterior, today: FieldMap) -> Outlook:
-        """The outlook from today's map.
+        """Return the outlook from today's map.
 
         Raises:
             InputError: see `maps.station_keys`.
@@ -51,24 +51,24 @@ class Outlook(Frozen):
 
     @property
     def valley(self) -> Mixture | None:
-        """The valley along phi that today's map follows, where it does."""
+        """The valley along phi that today's map follows; None where it follows none."""
         found = self.posterior.mixture(self.estimate.stations[self.today.station].camera)
         return found if found.is_followed else None
 
     def after(self, added: Information) -> Errors:
-        """The errors with information added, by the quadratic picture at the estimate.
+        """Return the errors with information added, by the quadratic model at the estimate.
 
-        Where phi was followed along its profile and would have to be still, see `shrunk`.
+        Where phi was followed along its profile and would still have to be, see `shrunk`.
         """
         known = self._known(added)
         bent = self.valley is not None and self._phi_sd(self.estimate, known) > BENT
         return self.shrunk(added) if bent else _errors(known, self.slopes)
 
     def after_each(self, known: Information, informations: Sequence[Information]) -> list[Errors]:
-        """The errors with each of some informations added, beside what is known by then of all numbers (`known`).
+        """Return the errors with each of some informations added, beside what is `known` by then of all numbers.
 
-        A measurement tells of few directions: with R its root and C the covariance before it, places of slopes J lose J
-        C R^T (1 + R C R^T)^-1 R C J^T.
+        A measurement determines few directions. With R its root and C the covariance before it, the covariance of
+        places with slopes J falls by J C R^T (1 + R C R^T)^-1 R C J^T.
         """
         whole = self.posterior.information + known
         spread = whole.spread
@@ -81,7 +81,7 @@ class Outlook(Frozen):
         along = np.ascontiguousarray(along.reshape(-1, len(whole.keys)).T)
 
         def after(added: Information) -> Errors:
-            told = np.flatnonzero(np.diagonal(added.matrix))  # of many nodes of a surface a measurement sees a few
+            told = np.flatnonzero(np.diagonal(added.matrix))  # a measurement sees few of the nodes of a surface
             root = thin_root(added.matrix[np.ix_(told, told)], sd[told])
             covariance = spread.covariance[np.ix_(told, told)]
             half = inverse_root_of(np.eye(len(root)) + root @ covariance @ root.T)
@@ -91,7 +91,7 @@ class Outlook(Frozen):
         return list(map(after, informations))
 
     def shrunk(self, added: Information) -> Errors:
-        """Today's errors, smaller as those of the quadratic picture get smaller with information added."""
+        """Return today's errors, reduced by the factor by which the information reduces the quadratic model's."""
         today = Information.nothing(added.keys)
         now, then = (_errors(self._known(more), self.slopes) for more in (today, added))
         if not np.isfinite(now.worst_mm):
@@ -100,16 +100,16 @@ class Outlook(Frozen):
         return Errors(worst, self.before.mean_mm * min(then.mean_mm / now.mean_mm, 1.0))
 
     def _phi_sd(self, estimate: Estimate, known: Spread) -> float:
-        """Relative standard deviation of phi by what is known of the K numbers; 0 where it is held."""
+        """Return the relative standard deviation of phi by the distribution of the K numbers; 0 where it is held."""
         camera = estimate.stations[self.today.station].camera
         column = next((i for i, key in enumerate(self.keys) if key[:3] == ("camera", camera, "phi")), None)
         return 0.0 if column is None else float(known.sd[column]) / estimate.cameras[camera].phi
 
     def _known(self, added: Information) -> Spread:
-        """What is known of the K numbers with information added."""
+        """Return the distribution of the K numbers with information added."""
         own = set(self.keys)
         others = [key for key in added.keys if key not in own]
-        if not np.any(added.matrix[added.columns(others)]):  # nothing of what is integrated out: do that once
+        if not np.any(added.matrix[added.columns(others)]):  # no information about others: integrate these out once
             return (self._own + added.given(self.keys)).spread
         whole = self.posterior.information + added
         return _part(whole.spread, whole.columns(self.keys))
@@ -120,8 +120,8 @@ class Outlook(Frozen):
 
     @cached_property
     def possible(self) -> tuple[tuple[int, Estimate], ...]:
-        """Some nodes of the valley within its 95 % bounds, by number; none where phi is not followed."""
-        nodes = 7  # of a valley at which a promise is worked out
+        """Some nodes of the valley within its 95 % bounds, with their numbers; none where phi is not followed."""
+        nodes = 7  # of a valley at which a promise is evaluated
         if self.valley is None:
             return ()
         keys, steps, (at, roots) = self.valley.keys, self.valley.steps, self.valley.chains[0]
@@ -131,15 +131,15 @@ class Outlook(Frozen):
 
     @cached_property
     def _possible_slopes(self) -> tuple[Array, ...]:
-        """Like `slopes`, where each of these is true."""
+        """`slopes` at each of the possible estimates."""
         return tuple(_slopes(there, self.today, self.keys) for _, there in self.possible)
 
     def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
-        """phi (px), its relative standard deviation and the errors if that is what it is and the information there is
-        added, over what phi may be by its 95 % bounds.
+        """Yield phi (px), its relative standard deviation and the errors, if this is phi and the information there is
+        added, for values of phi within its 95 % bounds.
 
-        There the observations of today tell everything but phi as the valley has it, and phi by the parabola that fits
-        the valley best. Where nothing would be seen of what is added, all of it is infinite.
+        There, today's observations determine everything but phi as in the valley, and phi by the parabola that fits the
+        valley best. Where nothing of the addition would be seen, the standard deviation and the errors are infinite.
         """
         valley = self.valley
         assert valley is not None
@@ -162,17 +162,17 @@ class Outlook(Frozen):
 
 
 def _part(known: Spread, at: Indices) -> Spread:
-    """What is known of some of the numbers."""
+    """Return the distribution of some of the numbers."""
     return Spread(known.covariance[np.ix_(at, at)], known.unknown[at], known.scale[at])
 
 
 def _errors(known: Spread, slopes: Array) -> Errors:
-    """The errors of places with slopes (N, 2, K) by numbers of which so much is known."""
+    """Return the errors of places with slopes (N, 2, K) by numbers with this distribution."""
     return _errors_of(np.trace(known.through(slopes), axis1=1, axis2=2))
 
 
 def _errors_of(variances: Array) -> Errors:
-    """The errors of places whose x and y have variances (N,) together, m^2; far up a valley the image shows none."""
+    """Return the errors of places with variances (N,) of x and y together, m^2; far up a valley none is visible."""
     if not len(variances):
         return Errors(np.inf, np.inf)
     sd = 1e3 * np.sqrt(variances)
@@ -180,6 +180,6 @@ def _errors_of(variances: Array) -> Errors:
 
 
 def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
-    """(N, 2, K) of the N places of the grid that the image shows."""
+    """(N, 2, K) slopes of the N places of the grid that the image shows."""
     pixels = visible_pixels(estimate, grid.station, grid.places, grid.height_m)
     return locate_slopes(estimate, keys, grid.station, pixels[np.isfinite(pixels[:, 0])], grid.height_m)

@@ -1,4 +1,4 @@
-"""What to measure next, and what it would bring, in mm."""
+"""What to measure next, and how far it would reduce errors, in mm."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from ceres_cal.problem import Estimate, Information, Weighting
 from ceres_cal.scene.targets import Target, still
 
 _LARGER, _LESS = 0.5, 0.2
-"""Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
-the best's, and what it takes off smaller by no more than the second share of the best's."""
-# Of today's worst error; what leaves more is not advised: less than a tenth is within what advice is off by.
+"""A measurement with less work is nearly as good as the best one if the error that it leaves is larger by no more than
+the first share of the best's, and the reduction smaller by no more than the second share of the best's."""
+# Share of today's worst error; what leaves more is not advised: less than a tenth is within the error of advice.
 # Nothing changes from 0.82 to 0.95.
 _MUST_LEAVE = 0.9
 
 
 class Promise(Frozen):
-    """What one measurement would bring.
+    """What one measurement would achieve.
 
     Attributes:
-        after: the errors that it leaves, where everything is as estimated.
-        valley: where phi is followed along its profile today, and the measurement settles it: phi (px) and the errors
-            left if that is what phi is, over its 95 % bounds.
-        rough: whether phi is followed along its profile and might have to be still. Then `after` is a guess: what was
-            obtained in simulation is from a tenth to five times of it, or known where it says unknown.
+        after: the errors that it leaves, if everything is as estimated.
+        valley: where phi is followed along its profile today, and the measurement determines it: phi (px) and the
+            remaining errors if that is phi, over its 95 % bounds.
+        rough: whether phi is followed along its profile and might still have to be. Then `after` is a guess: in
+            simulations errors were from a tenth to five times of it, or known where it says unknown.
     """
 
     measurement: Measurement
@@ -46,7 +46,7 @@ class Promise(Frozen):
 
     @property
     def worst_range_mm(self) -> tuple[float, float]:
-        """Least and largest worst error, over what phi may be."""
+        """Least and largest worst error, over the possible values of phi."""
         worst = [self.after.worst_mm, *(errors.worst_mm for _, errors in self.valley)]
         return min(worst), max(worst)
 
@@ -55,10 +55,10 @@ class Advice(Frozen):
     """Measurements and their promises, the one that leaves the smallest worst error first.
 
     Attributes:
-        station: whose map. height_m: at which height. before: its errors today; worst_place_m: where they are largest.
+        station, height_m: of the map. before: its errors today; worst_place_m: where they are largest.
         promises: best first. best: the one to follow, with the least work of those that are nearly as good as the best;
-            None where nothing brings enough. then: what to do after it, with what both together leave.
-        good_enough_mm: what the worst error may be; None where nobody said.
+            None where nothing improves enough. then: what to do after it, with the errors that both together leave.
+        good_enough_mm: the acceptable worst error; None where nobody stated it.
     """
 
     station: str
@@ -88,20 +88,20 @@ def advise(
     progress: StepProgress | None = None,
     executor: Executor | None = None,
 ) -> Advice:
-    """What to measure besides, ranked by the worst error that it leaves on a station's map.
+    """Return what to measure next, ranked by the worst error that it leaves on a station's map.
 
-    Computed from the posterior and what each measurement would add to it at the estimate (no observations are needed),
-    with the noise that the calibration found. It promises what the next calibration will say of itself; model error (a
-    lens with too few coefficients, a field painted amiss) is in neither.
+    It is computed from the posterior and the information that each measurement would add at the estimate (no
+    observations are needed), with the noise that the calibration found. It promises what the next calibration will
+    report; errors of the model (a lens with too few coefficients, a field painted off its nominal position) are in
+    neither.
 
     Args:
-        station: may be left out where there is only one. board: that could be shown; by default the calibration's own,
-            or one of 9 x 6 corners, 100 mm apart. progress: called after each measurement that was looked at.
-        executor: over which the measurements go; the same advice whatever it is.
+        station: may be omitted where there is only one. board: one that could be shown; by default the calibration's
+            own, or one of 9 x 6 corners, 100 mm apart. progress: called after each measurement that was examined.
+        executor: evaluates the measurements; the advice does not depend on it.
 
     Raises:
-        InputError: no such station, one that was held as the world, or a calibration that says nothing of how well it
-            is known.
+        InputError: no such station, one that was held as the world, or a calibration without a posterior.
     """
     if board is not None and board.grid is None:
         raise InputError(f"a board to show is a checkerboard, not of kind {board.kind!r}")
@@ -138,7 +138,7 @@ def promised(
     station: str | None = None,
     height_m: float = ROBOT_TOP_M,
 ) -> tuple[Promise, ...]:
-    """What measurements of one's own would bring, each by itself.
+    """Return what measurements of one's own would achieve, each by itself.
 
     Raises:
         InputError: see `advise`.
@@ -148,7 +148,7 @@ def promised(
 
 
 def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
-    """What to add to, and the outlook: both of the numbers that a measurement at this station can tell of."""
+    """Return the ground and the outlook, both of the numbers that a measurement at this station can determine."""
     known = calibration.uncertainty
     if not still(calibration.targets):
         raise InputError("advice is about a map of a field, and there is none: nothing that was observed stands still")
@@ -163,7 +163,7 @@ def _prepared(calibration: Calibration, station: str | None, height_m: float) ->
 
 
 def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posterior:
-    """What is known of a camera, its stations and the targets as built, all else integrated out."""
+    """Return the posterior of a camera, its stations and the targets as built, all else integrated out."""
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
     keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
     stated = posterior.stated.over(posterior.keys).marginal(keys)
@@ -174,8 +174,8 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
 
 
 def _weighting(fit: Fit, camera: str) -> Weighting:
-    """Noise in px of a camera's points and curves, as the fit found it; of a kind that nobody observed, the other's; of
-    targets that differ in it ("camera/target"), the noisiest's.
+    """Return the noise in px of a camera's points and curves, by the fit. A kind that nobody observed gets the other's;
+    of targets with different noise ("camera/target") it is the largest.
     """
     points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
@@ -195,9 +195,10 @@ def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Ta
 
 
 def _promise(measurement: Measurement, added: Information, ground: Ground, outlook: Outlook) -> Promise:
-    """Sure where phi is not followed along its profile, or would not have to be any more, whatever it is.
+    """Return a promise; it is not rough where phi is not followed along its profile, or would not have to be any more,
+    whatever its value.
 
-    Where the camera would not see what is measured does not count: who measures will see.
+    Values of phi at which the camera would not see what is measured do not count: it will be seen when it is measured.
     """
     after = outlook.after(added)
     if outlook.valley is None:
@@ -210,13 +211,13 @@ def _promise(measurement: Measurement, added: Information, ground: Ground, outlo
 
 
 def _information_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Information:
-    """What it would say if everything were elsewhere: boards are held before the camera, wherever that is."""
+    """Return its information if everything were elsewhere: boards are held before the camera, wherever that is."""
     here, other = (e.stations[outlook.today.station].cam_from_world for e in (ground.estimate, there))
     return news(measurement.before(here, other), replace(ground, estimate=there), outlook)
 
 
 def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
-    """Number of the one with the least work that is good enough whatever phi is, or nearly as good as the best."""
+    """Return the index of the least work that is good enough for each phi, or nearly as good as the best; else None."""
     worst = np.array([promise.after.worst_mm for promise in promises])
     least = float(np.min(worst))
     if before.worst_mm <= enough_mm or not least < _MUST_LEAVE * before.worst_mm:
@@ -233,7 +234,7 @@ def _next(
     outlook: Outlook,
     enough_mm: float,
 ) -> Promise | None:
-    """What brings most after the first, of another kind; None where nothing does, or the first is good enough."""
+    """Return what improves most after the first, of another kind; None where nothing does or the first is enough."""
     kind, again = candidates[first].kind, candidates[first].is_seen_again
     others = [
         number
