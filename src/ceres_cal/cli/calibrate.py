@@ -34,7 +34,7 @@ def _lens_kind(name: str) -> str:
 
 
 class CalibrateArguments(arguments.ReportArguments):
-    """What is estimated and how; arguments with names of `Options` are passed on unchanged."""
+    """Arguments of `calibrate`: what is estimated and how. Those with names of `Options` are passed on unchanged."""
 
     observations: tuple[str, ...] = argument(
         "OBS", "files of observations (.json, .npz, or one folder .columns); several are taken together"

@@ -228,8 +228,8 @@ def _of_folder(folder: Path) -> Iterator[JobSpec]:
 
 
 def _holds_observations(file: Path) -> bool:
-    """Whether a file holds observations, by its ending, and for JSON by its beginning: calibrations and truths may lie
-    beside.
+    """Whether a file holds observations, by its ending, and for JSON by its beginning. Calibrations and true values may
+    be in the same folder.
     """
     first = 1000  # bytes
     if file.suffix not in _OBSERVATIONS or not file.is_file():

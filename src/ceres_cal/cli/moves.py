@@ -319,7 +319,7 @@ def _explained(one: moves.Agreement) -> str:
 
 
 class RefitArguments(InputArguments, arguments.ReportArguments):
-    """What was seen after a move, and what may have changed."""
+    """Arguments of `refit`: the observations after a move, and what may have changed."""
 
     output: Path | None = arguments.output_option("the new calibration", None)
     what: Literal["auto", "pose", "pose-only", "zoom", "iris", "everything"] = option(

@@ -62,7 +62,7 @@ def make(
         done.append(step)
         if known is None:
             return step.answer().data["found"]
-        # What the command wrote when the lines were found.
+        # The file that the command wrote when the lines were found.
         return write_bytes(step.output, known.observed[step.output.name])
 
     if state.board:

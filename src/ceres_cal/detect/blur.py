@@ -31,7 +31,7 @@ _OF_COMA = 0.4
 
 
 class Blur(Rows):
-    """What makes the lines wider at N places.
+    """The blur of the lines at N places, and the width of their paint.
 
     Attributes:
         blur_px: (N,) standard deviation of a Gaussian that stands for lens and pixel together.

@@ -56,7 +56,7 @@ _SCATTER_PX = np.concatenate([[0.0], np.geomspace(0.002, 1.0, 60)])
 
 
 class Lines(Rows):
-    """What was measured at the places of a course.
+    """Measurements of the paint at the places of a course.
 
     Attributes:
         course: the places that were examined.

@@ -72,7 +72,7 @@ class Export(Frozen):
 
 
 class ExportRequest(Struct, frozen=True, eq=False):
-    """What is to be exported.
+    """A request to export stations of a calibration.
 
     Attributes:
         stations: names; one or, where the format holds several, any number.
@@ -124,7 +124,7 @@ def _options(work: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
 
 
 class ImportRequest(Struct, frozen=True, eq=False):
-    """What is to be read.
+    """A file or folder to read.
 
     Attributes:
         path: of the file or folder. content: of the file; empty for a folder.

@@ -46,7 +46,7 @@ def export(
         options: the format's own.
 
     Returns:
-        What was written, and its errors.
+        The exported content and its errors.
 
     Raises:
         InputError: no such format, station, option or ending of a file, several stations for a format that holds one, a

@@ -86,7 +86,7 @@ def geometry_from_bytes(content: bytes) -> dict[str, Any]:
     Raises:
         InputError: neither, or a packet without geometry.
     """
-    geometry = attempt(lambda: from_bytes("SSL_GeometryData", content))  # quiet: the other one's failure is told
+    geometry = attempt(lambda: from_bytes("SSL_GeometryData", content))  # quiet: the other one's failure is reported
     if isinstance(geometry, dict):
         return geometry
     packet = from_bytes("SSL_WrapperPacket", content)

@@ -16,7 +16,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Ma
 
 
 class View(Frozen, eq=True):
-    """What one frame shows of one target. `placement` is None for a target in the world, such as a field."""
+    """The view of one target in one frame. `placement` is None for a target in the world, such as a field."""
 
     frame: str
     camera: str

@@ -333,7 +333,7 @@ class Observations(Content):
         _require_letters("placement", placed)
 
     def _odd_view(self, number: int, owner: Mapping[str, str], placed: Mapping[str, str]) -> str:
-        """What is wrong with a view. owner, placed: camera of each station and target of each placement before it."""
+        """Describe a view's error. owner, placed: camera of each station and target of each placement before it."""
         here, view = view_label(number, self.views), self.views[number]
         if view.camera not in self.cameras:
             return f"{here}: {no_such('camera', view.camera, self.cameras)}"

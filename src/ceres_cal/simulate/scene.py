@@ -13,7 +13,7 @@ from ceres_cal.scene import SIDES, Camera, Target
 
 
 class ViewPlan(Frozen, eq=True):
-    """What frames taken at one station show of one target: one view per frame.
+    """Views of one target in frames taken at one station: one view per frame.
 
     The frames of a plan differ only in their noise, outliers, wrong labels and hidden stretches. Many frames in one
     plan are fast, because the target is projected once.

@@ -74,10 +74,10 @@ class State(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PageContext(Struct, frozen=True):
-    """What does not change while the page is open.
+    """The inputs of the page that do not change while it is open.
 
     Attributes:
-        photographs: named photographs. sizes: their (width, height) px. folder: for results.
+        photographs: those named. sizes: their (width, height) px. folder: for results.
         target: the named field; no other file is read for one.
         start, other: named calibrations; the search for the field starts from the first.
     """

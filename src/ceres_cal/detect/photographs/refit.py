@@ -29,8 +29,8 @@ ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
 class PointHints(Frozen):
-    """What a user showed of a target: points by their index (P,) in the target, pixels (P, 2), sigma_px (P,), and
-    places (N, 2) px on curves (N,), with sigmas (N,) px.
+    """Features of a target that a user marked in a photograph: points by their index (P,) in the target, pixels (P, 2),
+    sigma_px (P,), and places (N, 2) px on curves (N,), with sigmas (N,) px.
     """
 
     target: Target
@@ -75,7 +75,7 @@ class PointHints(Frozen):
 
 
 class FreeIntrinsics(Frozen):
-    """What a photograph may change of the camera besides its pose, and of the target.
+    """Free numbers of the camera besides its pose, and of the target, in a fit to a photograph.
 
     Attributes:
         names: free intrinsics, in the order in which they are freed.

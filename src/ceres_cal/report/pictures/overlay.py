@@ -178,8 +178,8 @@ def places_in_picture(
 
 
 class Model(Struct, frozen=True, eq=False):
-    """What is drawn into a photograph of `image_size`: lines, and points (N, 2) px. Each line consists of its middle
-    (S, 2) px, NaN where the camera does not show it, followed by both edges if the paint is wide.
+    """Lines, and points (N, 2) px, to draw into a photograph of `image_size`. Each line consists of its middle (S, 2)
+    px, NaN where the camera does not show it, followed by both edges if the paint is wide.
     """
 
     image_size: tuple[int, int]

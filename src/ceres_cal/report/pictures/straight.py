@@ -21,7 +21,7 @@ _ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms of width over height
 
 
 class Straightening(Struct, frozen=True, eq=False):
-    """How photographs of one camera are straightened.
+    """The straightening of photographs of one camera.
 
     Attributes:
         camera: camera of the straight image, a pinhole at the photograph's pose; its projection and location apply to

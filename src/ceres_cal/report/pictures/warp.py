@@ -23,7 +23,7 @@ MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # the limit of OpenCV's remap i
 
 
 class Warp(Struct, frozen=True, eq=False):
-    """Where in the photograph the pixels of a new picture lie.
+    """The place in the photograph of each pixel of a new picture.
 
     Where many pixels of the photograph fall into one of the picture, that pixel is the mean over `fine` x `fine` small
     squares, so that thin lines become fainter there, not broken.
