@@ -274,7 +274,7 @@ class ScoreTest(Frozen):
         effect, number: the group. statistic: decrease of the squared residuals, in variances. rank: determined numbers.
         log_p: natural logarithm of the probability of such a statistic in noise, not corrected for the number of tests.
         amount: (Q,) the amounts that would correct it. sd: (Q,) their standard deviations, infinite if undetermined.
-        rivals: alternatives of other kinds that explain nearly as much, and nothing more beside it.
+        rivals: alternatives of other kinds that explain nearly as much, and nothing once it is included.
     """
 
     effect: EffectColumns

@@ -423,7 +423,7 @@ def _stated_together(model: Linearised, group: Indices, scales: tuple[float, flo
     """(G, P, P) the amount added to the covariance of each group's score where observations scatter clearly less than
     their stated sigmas: as likely as not, the rest is an error that neighbours share, which no residual shows.
     """
-    likely, by_chance, alike = 0.5, 1.0, 1e-3  # by_chance: standard errors of a scale. alike: sigmas, stated for all
+    likely, by_chance, alike = 0.5, 1.0, 1e-3  # probability; standard errors; spread of sigmas stated for all
     scores = np.zeros((int(group.max()) + 1, *2 * (model.columns.shape[1] - 7,)))
     for is_curve, scale in zip((False, True), scales, strict=True):
         rows = np.flatnonzero((model.equations.is_curve == is_curve) & model.used)

@@ -319,8 +319,8 @@ class Effect(Frozen):
 
     def variances(self, case: Case, score: ScoreTest) -> Array:
         """(Q,) expected variances of the amounts of a group: what the residuals show, within limits from the usual
-        size. A bow of 24 ± 26 mm moves a camera only by what floors usually have, and one of 150 ± 30 mm is something
-        else that looks like it. Infinite where no size is usual.
+        size. A bow of 24 ± 26 mm moves a camera only by what floors usually have, not by 24 mm, and one of 150 ± 30 mm
+        is something else that looks like it. Infinite where no size is usual.
         """
         most = 4.0  # largest size in usual sizes: 9 mm for a field of 9 m
         prior = self.prior_of(score.effect, score.number, case)

@@ -278,7 +278,7 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
 
 def _solver_options(problem: Problem, blocks: Mapping[Owner, Array], precision: float) -> Any:
     dense_limit = 600  # numbers left after the Schur complement, above which a sparse factorisation is faster
-    dense_blocks = 2000  # numbers below which few full blocks are dense: two of 850 take .1 s, sparse half a minute
+    dense_blocks = 2000  # numbers up to which full blocks are solved densely: two of 850 take .1 s, not half a minute
     most_invalid = 20  # consecutive invalid steps: the trust region shrinks ever faster, and no pose lies beyond
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in problem.layout.free.values()) + len(blocks[STRUCTURE])

@@ -65,7 +65,7 @@ class Key(NamedTuple):
 
 
 def sigma_limits(keys: Sequence[Key]) -> Array:
-    """(P,) sigmas above which a number counts as unknown: turns of many turns, a camera in orbit."""
+    """(P,) sigmas above which a number counts as unknown: angles of many turns, a camera in orbit."""
     return np.array([_LIMITS.get(key.unit, 1e12) for key in keys])
 
 

@@ -222,8 +222,8 @@ def stated_priors(
 
 
 def freed(observations: Observations, options: Options) -> Options:
-    """The options with camera numbers that they hold replaced by priors as close as any. Held coefficients, which have
-    no natural size for a relative sigma, get a tenth of the solver's unit.
+    """The options with their held camera numbers replaced by priors of the least sigma. Held coefficients, which have
+    no size for a relative sigma, get a sigma of a tenth of the solver's unit.
     """
     held = {name: (value,) for name, value in options.fixed.items() if name in OF_PIXELS}
     each = list[Prior]()

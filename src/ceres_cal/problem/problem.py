@@ -49,7 +49,7 @@ class RemoteObservations(Protocol):
 
     @property
     def equations(self) -> int:
-        """The number of measured numbers."""
+        """The number of scalar measurements."""
 
     def cost(self, run: Any, problem: Problem, estimate: Estimate) -> Any:
         """Their cost function for Ceres. Its `owners` name, by kind and name, the numbers that it depends on."""
@@ -142,7 +142,7 @@ class Problem(Frozen):
 
     @property
     def equations(self) -> int:
-        """The number of measured numbers: two for each point, one for each curve observation."""
+        """The number of scalar measurements: two for each point, one for each curve observation."""
         return self.sights.equations + (self.elsewhere.equations if self.elsewhere else 0)
 
     def unknowns(self, estimate: Estimate) -> int:

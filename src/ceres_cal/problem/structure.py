@@ -82,7 +82,7 @@ class Structure(Frozen):
 
     @property
     def own(self) -> int:
-        """Number of the numbers that are offsets."""
+        """How many of the numbers are offsets."""
         return len(self.names) - len(self.drawn_m)
 
     @property

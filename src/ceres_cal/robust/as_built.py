@@ -87,7 +87,7 @@ def solve_as_built(
     views: ViewEffects | None = None,
     left_out: frozenset[tuple[str, Kind]] = frozenset(),
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
-    """Solve for everything that likely differs from its drawing. Returns the end, problem, explanations, and what does.
+    """Solve for everything that likely differs from its drawing. Returns end, problem, explanations and these kinds.
 
     Args:
         problem: of all the observations. end: of its rounds, without what the explanations left out, with targets drawn
@@ -228,7 +228,7 @@ def _held(problem: Problem, built: Construction) -> Problem:
 
 
 def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> RobustSolution:
-    """The end of a solve with targets held as they are built, as the end of a problem in which that is free."""
+    """The end of a solve with targets held as built, as the end of a problem in which their offsets are free."""
     sights = problem.used(end.inliers.points, end.inliers.curves).sights
     estimate = replace(end.estimate, structure=structure)
     solution = replace(end.solution, estimate=estimate)

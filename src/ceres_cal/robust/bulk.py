@@ -24,7 +24,7 @@ from ceres_cal.problem.shares import Histogram, ResidualSummary, RowSelection, S
 from ceres_cal.robust.noise import SAME, Inliers, NoiseScales, Redundancy, by_count, by_leverage, noise_of
 from ceres_cal.robust.robust import RobustSolution, Rounds
 
-# Observations of the subset, about, and views in it at least.
+# Approximate number of observations in the subset, and least number of views of the world in it.
 _PART, _FEWEST_VIEWS = 300_000, 200
 _STANDING_OUT = 12  # further views of the largest residuals, and as many of the most outliers
 

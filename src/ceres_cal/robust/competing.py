@@ -34,7 +34,7 @@ FEWEST = 3  # observations of a group: two numbers describe the offset of a line
 
 # Share of inliers in a group below which it is suspected in any case: the rows that are left agree only by chance.
 _LEFT = 0.5
-# Observations in the subset, about, and views in it at least. The influence of the free numbers is projected out of the
+# Approximate number of observations in the subset, and least number of views. The free numbers are projected out of the
 # few rows that are compared, so a solve only has to end in the right valley.
 _MOST_ASKED, _FEWEST_ASKED = 200_000, 200
 

@@ -30,8 +30,8 @@ _BORROWED = 4.0
 # Degrees of freedom for which a noise scale known from earlier observations counts, so that a few exact observations do
 # not make the scale 0. Halving or doubling changes nothing.
 USUAL_EQUATIONS = 10.0
-# Share by which the observations within the bound may grow when the bound follows their own scale, and still be the
-# tail of the same noise: it is 1 % for Student's t with two degrees of freedom, and more for outliers.
+# Share by which the observations within the bound may grow when the bound follows their own scale, and still count as
+# the tail of the same noise: 1 % for Student's t with two degrees of freedom, more for outliers.
 _TAIL = 0.02
 # Share of the square root of the number of observations. If no more of them at the rejection bound change sides, shared
 # numbers move by less than 0.05 sd. Of fewer than 60 000 observations none may.

@@ -66,7 +66,7 @@ def initialise(sights: Sights, options: Options) -> Start:
     Raises:
         DegenerateError: it names the sight whose pose the observations do not determine.
     """
-    least_sigmas, better = 5.0, 0.75  # large residuals; ratio of better ones (a wrong quarter: 1.3 to 20)
+    least_sigmas, better = 5.0, 0.75  # residuals that are large; ratio that is better (wrong quarters: 1.3 to 20)
     share = 0.22  # distance of the quarters from the middle, as a share of the picture's size
     observations = sights.observations
     start, places = _initialised(sights, options)
