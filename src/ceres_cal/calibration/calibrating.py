@@ -122,6 +122,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     Args:
         knows: whether whole curves are tested for being outliers and a posterior is made. Otherwise phi may end
             anywhere along its valley, and only single observations are rejected.
+
     Raises:
         CalibrationError: see `calibrate`.
     """

@@ -392,7 +392,7 @@ def _start_of(others: Problem, some: Subproblem, first: TaskSolution) -> Estimat
     """Return a start independent of the other observations; in a refit and for the world it is the first start."""
     alike = set(others.sights.keys) == set(some.problem.sights.keys)
     if first.task.before is not None or not alike or all(key.placement is None for key in others.sights.keys):
-        return first.start.estimate  # that of the world was found with what does not belong among the rest
+        return first.start.estimate  # that of the world was found with outliers among the observations
     return initialise(others.sights, others.options).estimate
 
 

@@ -82,7 +82,6 @@ def refit(
     Raises:
         InputError: names that do not fit the calibration, a calibration without a posterior, or its own observations.
         DegenerateError: the observations do not determine a pose, or not uniquely after so large a move.
-        DegenerateError: the observations cannot tell a pose, or not for sure after so large a move.
         SolutionError: no explanation fits, or one does that `what` does not allow; the message says which.
     """
     plan = make_plan(calibration, observations, what, moved, options)

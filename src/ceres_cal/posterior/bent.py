@@ -204,7 +204,7 @@ class Ends(Frozen):
 
     @property
     def excesses(self) -> Array:
-        """(2 B, K) how much farther out the ends are than the steps, in sds of half a direction each."""
+        """(2 B, K) ends minus steps, per standard deviation; each end counts half of its direction's variance."""
         return np.asarray((self.ends - self.steps) / (self.half_width * np.sqrt(2.0)))
 
     def beside(self, stated: Information) -> Ends:

@@ -1,13 +1,11 @@
-"""Segments and arcs as painted on a target, places along them, and the place that lies nearest to something.
+"""Segments and arcs as painted on a target, places along them, and the place on them that is nearest to something.
 
-Curves lie in a plane of constant z, seen from above (from +z) when sides are named.
+Curves lie in a plane of constant z; sides are named as seen from above (from +z).
 
-Where a target's lines and arcs cross: places that have names without being named.
-
-The crossing of curves A and B is "A*B", or "B*A". Where they cross twice (a line through a circle, two circles) the two
-are "A*B#1" and "A*B#2", counted along the one of them that is a line, or comes first in the target. Lines count as
-crossing up to half a width past their ends, so that corners do; curves that meet at less than 10 degrees, or touch, do
-not: nobody could say where.
+The crossings of a target's lines and arcs are places with names, too. The crossing of curves A and B is "A*B", or
+"B*A". Where they cross twice (a line through a circle, two circles) the two are "A*B#1" and "A*B#2", counted along the
+one that is a line, or that comes first in the target. Lines count as crossing up to half a width past their ends, so
+that corners do. Curves that meet at less than 10 degrees, or touch, do not: the place would be undetermined.
 """
 
 from __future__ import annotations
@@ -22,19 +20,19 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, InputError, Mask, dots
 
 SIDES = {"centre": 0, "left": 1, "right": -1}
-"""Which part of a painted curve was observed. Left and right are those of someone walking along it: from `start` to
+"""Which part of a painted curve was observed. Left and right are seen by somebody who walks along it: from `start` to
 `end` of a segment, counter-clockwise on an arc (so left is the inside)."""
 
 
 def xyz(values: Sequence[float]) -> tuple[float, float, float]:
-    """Three plain floats, whatever kinds of numbers they were."""
+    """Return three plain floats, from numbers of any type."""
     x, y, z = (float(v) for v in values)
     return x, y, z
 
 
 class Segment(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"start": "from", "end": "to"}
-):  # as files have it
+):  # names in files
     """A straight line from `start` to `end`, (x, y, z) m; `width_m` is that of the paint, 0 for a bare edge."""
 
     start: tuple[float, float, float]
@@ -91,7 +89,7 @@ Curve = Segment | Arc
 
 
 def _with_plain_floats(curve: Curve, *places: str) -> None:
-    """Plain floats in a frozen curve, whatever kinds of numbers it was made of: what a file would give back."""
+    """Convert the numbers of a frozen curve, of any type, to plain floats, as a file would give them."""
     for name, value in msgspec.structs.asdict(curve).items():
         try:
             plain = xyz(value) if name in places else float(value)
@@ -104,7 +102,7 @@ def _with_plain_floats(curve: Curve, *places: str) -> None:
 
 
 def along_track(track: ArrayLike, is_arc: bool | Mask, s: ArrayLike) -> Array:
-    """C(s) on one track (3, 3) or on one track per s (N, 3, 3): (N, 3) m; of any shapes that fit each other."""
+    """(N, 3) m, C(s) on one track (3, 3) or on one track for each s (N, 3, 3); other shapes are broadcast."""
     tracks, s = np.asarray(track, dtype=float), np.asarray(s, dtype=float)
     turns = np.broadcast_to(is_arc, s.shape)
     first, second = s.copy(), np.zeros(s.shape)
@@ -129,7 +127,7 @@ def curve_points(curve: Curve, side: int, pieces: int) -> Array:
 def nearest_on_track(tracks: Array, is_arc: bool | Mask, points: Array) -> Array:
     """Parameter s (N,) of the place on one track (3, 3), or on each track (N, 3, 3), nearest to each point (N, 3).
 
-    Past the curve's ends, too; of an arc from -pi to pi.
+    It may lie past the curve's ends; an arc's is from -pi to pi.
     """
     c, a, b = tracks[..., 0, :], tracks[..., 1, :], tracks[..., 2, :]
     away = points - c
@@ -139,9 +137,10 @@ def nearest_on_track(tracks: Array, is_arc: bool | Mask, points: Array) -> Array
 
 
 def nearest_to_rays(tracks: Array, is_arc: bool | Mask, origin: Array, rays: Array) -> Array:
-    """Parameter s (N,) of where each ray (N, 3) from `origin` (3,) passes a track (3, 3) or (N, 3, 3) nearest.
+    """Parameter s (N,) of the place on a track (3, 3) or (N, 3, 3) that each ray (N, 3) from `origin` (3,) passes
+    nearest.
 
-    Of an arc it is where the ray meets the arc's plane, of a segment the foot of the common perpendicular; 0 where
+    For an arc it is where the ray meets the arc's plane, for a segment the foot of the common perpendicular; 0 where
     there is none.
     """
     c, a = tracks[..., 0, :], tracks[..., 1, :]
@@ -155,7 +154,7 @@ def nearest_to_rays(tracks: Array, is_arc: bool | Mask, origin: Array, rays: Arr
 
 
 def turned_on(curve: Curve, s: Array) -> Array:
-    """The same places with an arc's parameter (N,) from its beginning to a full turn on; a segment's as it is."""
+    """Return an arc's parameters (N,) of the same places within a full turn from its beginning; a segment's as is."""
     return np.asarray(curve.from_rad + np.mod(s - curve.from_rad, 2.0 * np.pi)) if isinstance(curve, Arc) else s
 
 
@@ -163,7 +162,7 @@ def nearest_on_curve(curve: Curve, points: Array) -> Array:
     """Parameter s (N,) of the place between the curve's ends nearest to each point (N, 3)."""
     low, high = curve.parameter_range
     s = turned_on(curve, nearest_on_track(curve.track(), isinstance(curve, Arc), points))
-    if isinstance(curve, Arc):  # what lies past its end is nearer to one of its two ends
+    if isinstance(curve, Arc):  # a place past its end is nearest to one of its two ends
         s = np.where(s <= high, s, np.where(s - high < low + 2.0 * np.pi - s, high, low))
     return np.asarray(np.clip(s, low, high))
 
@@ -176,22 +175,22 @@ def distance_to_curve(curve: Curve, points: Array) -> Array:
 Place = tuple[float, float, float]
 
 MOST_CURVES = 300
-"""More than these are no drawing that somebody reads names off: their crossings have none."""
+"""Largest number of curves whose crossings have names: nobody reads names off a drawing with more."""
 _SAME_M = 1e-6
 
 
 def crossings(curves: Mapping[str, Curve]) -> dict[str, Place]:
-    """Every crossing of two curves, by its name, in the order of the curves."""
+    """Return every crossing of two curves by its name, in the order of the curves."""
     return {names[0]: place for names, place in _named(curves)}
 
 
 def is_crossing(name: str) -> bool:
-    """Whether a point is there only because two curves cross, by its name."""
+    """Return whether a point exists only because two curves cross, by its name."""
     return "*" in name
 
 
 def with_crossings(points: Mapping[str, Place], curves: Mapping[str, Curve]) -> dict[str, Place]:
-    """The points, then the crossings at which there is none of them yet."""
+    """Return the points, then the crossings at which none of the points lies."""
     every, places = dict(points), np.array(list(points.values())).reshape(-1, 3)
     for name, place in crossings(curves).items():
         if not np.any(np.max(np.abs(places - place), axis=1, initial=0.0) < _SAME_M) if len(places) else True:
@@ -201,7 +200,7 @@ def with_crossings(points: Mapping[str, Place], curves: Mapping[str, Curve]) -> 
 
 
 def aliases(points: Mapping[str, Place], curves: Mapping[str, Curve]) -> dict[str, str]:
-    """Every name of a crossing that is none of the points' own -> the point that lies there."""
+    """Return every name of a crossing that is not a point's own name -> the point that lies there."""
     names, places = list(points), np.array(list(points.values())).reshape(-1, 3)
     found: dict[str, str] = {}
     for every, place in _named(curves):
@@ -211,7 +210,7 @@ def aliases(points: Mapping[str, Place], curves: Mapping[str, Curve]) -> dict[st
 
 
 def _named(curves: Mapping[str, Curve]) -> Iterator[tuple[tuple[str, str], Place]]:
-    """Both names of each crossing, and where it is."""
+    """Yield both names of each crossing, and its place."""
     if len(curves) > MOST_CURVES:
         return
     every = [(name, curve) for name, curve in curves.items() if 0.0 < curve.length_m < np.inf]
@@ -229,7 +228,7 @@ def _named(curves: Mapping[str, Curve]) -> Iterator[tuple[tuple[str, str], Place
 
 
 def _box(curve: Curve) -> Array:
-    """(2, 3) between which a curve lies, with its paint."""
+    """(2, 3) lowest and highest corner of the box around a curve, including its paint."""
     margin = 0.5 * curve.width_m + _SAME_M
     if isinstance(curve, Segment):
         return np.array([np.minimum(curve.start, curve.end) - margin, np.maximum(curve.start, curve.end) + margin])
@@ -238,11 +237,11 @@ def _box(curve: Curve) -> Array:
 
 
 def _met(one: Curve, other: Curve) -> list[Place]:
-    """The places at which two curves of one height cross, in their order along the first, or along the line.
+    """Return the places at which two curves of one height cross, in order along the first, or along the line.
 
-    In plain numbers: of two curves NumPy takes four times as long.
+    It uses plain numbers: for two curves NumPy takes four times as long.
     """
-    least_sine = 0.17  # of the angle between them
+    least_sine = 0.17  # of the smallest angle between them
     if isinstance(one, Arc) and isinstance(other, Segment):
         return _met(other, one)
     heights = {place[2] for curve in (one, other) for place in _levels(curve)}
@@ -264,7 +263,7 @@ def _levels(curve: Curve) -> tuple[Place, ...]:
 
 
 def _place_at(curve: Curve, s: float) -> Place:
-    """What `along_curve` says of one."""
+    """Return what `along_curve` gives for one parameter."""
     if isinstance(curve, Segment):
         x, y, z = (a + s * (b - a) for a, b in zip(curve.start, curve.end, strict=True))
         return x, y, z
@@ -276,7 +275,7 @@ def _place_at(curve: Curve, s: float) -> Place:
 
 
 def _meeting(one: Curve, other: Curve) -> list[float]:
-    """Parameters of where the first meets the other, an arc after its beginning."""
+    """Return the parameters at which the first curve meets the other; an arc's are after its beginning."""
     if isinstance(one, Arc):
         turned = _on_both(one, other) if isinstance(other, Arc) else []
         return [one.from_rad + (angle - one.from_rad) % (2.0 * math.pi) for angle in turned]
@@ -284,7 +283,7 @@ def _meeting(one: Curve, other: Curve) -> list[float]:
 
 
 def _on_line(one: Segment, other: Segment) -> list[float]:
-    """Of two lines; none where they are parallel."""
+    """Return the parameter of the crossing of two lines; none where they are parallel."""
     across = _from(other.start, other.end)
     turn = _cross(_from(one.start, one.end), across)
     if abs(turn) < 1e-12 * max(one.length_m * other.length_m, 1e-300):
@@ -293,7 +292,7 @@ def _on_line(one: Segment, other: Segment) -> list[float]:
 
 
 def _on_circle(one: Segment, other: Arc) -> list[float]:
-    """Of a line and a circle; none where it passes by."""
+    """Return the parameters where a line meets a circle; none where it does not."""
     (x, y), (u, v) = _from(one.start, one.end), _from(other.centre, one.start)
     a, b, c = x * x + y * y, u * x + v * y, u * u + v * v - other.radius_m**2
     root = b * b - a * c
@@ -301,7 +300,7 @@ def _on_circle(one: Segment, other: Arc) -> list[float]:
 
 
 def _on_both(one: Arc, other: Arc) -> list[float]:
-    """Angles on the first of two circles; none where they do not meet."""
+    """Return the angles on the first of two circles where they meet; none where they do not."""
     x, y = _from(one.centre, other.centre)
     far = math.hypot(x, y)
     if far < _SAME_M:
@@ -316,7 +315,7 @@ def _on_both(one: Arc, other: Arc) -> list[float]:
 
 
 def _is_between_ends(curve: Curve, place: Place, slack_m: float) -> bool:
-    """Whether a place on a whole line or circle lies between the curve's ends, or no farther past them."""
+    """Return whether a place on a whole line or circle lies between the curve's ends, or at most so far past them."""
     if isinstance(curve, Segment):
         s = sum((p - a) * (b - a) for p, a, b in zip(place, curve.start, curve.end, strict=True)) / curve.length_m
         return -slack_m < s < curve.length_m + slack_m
@@ -327,7 +326,7 @@ def _is_between_ends(curve: Curve, place: Place, slack_m: float) -> bool:
 
 
 def _way(curve: Curve, there: Place) -> tuple[float, float]:
-    """Of length 1."""
+    """Return the direction of a curve at a place, of length 1."""
     if isinstance(curve, Segment):
         x, y = _from(curve.start, curve.end)
         return x / curve.length_m, y / curve.length_m

@@ -1,4 +1,4 @@
-"""What a target looks like turned or mirrored: which of its features lie on which, and how often it can be turned."""
+"""A target turned or mirrored: which of its features coincide, and which turns leave it unchanged."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from ceres_cal.scene.curves import Arc, Curve, curve_points, distance_to_curve
 from ceres_cal.scene.targets import Target
 
 _SAME_M = 1e-6
-_PIECES = 32  # of a curve, whose ends have to lie on another one
+_PIECES = 32  # of a curve, whose ends must lie on another one
 TURNED, MIRRORED = np.array([-1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
-"""What x, y, z are multiplied by in half a turn about the middle of the world, and in its mirrored picture."""
+"""Factors on x, y, z for half a turn about the middle of the world, and for its mirror image."""
 
 
 # ---- feature by feature ---------------------------------------------------------------------------------------------
 
 
 def counterparts(target: Target, image: Array) -> tuple[Indices32, Indices32, Codes]:
-    """For each point and each curve the one that x, y, z times `image` (3,) sends it to (-1: none), and 1 or -1 for
-    the curve's side.
+    """Return for each point and each curve the one to which x, y, z times `image` (3,) sends it (-1: none), and 1 or -1
+    for the curve's side.
     """
     places = target.point_array
     to_point = np.full(len(places), -1, dtype=np.int32)
@@ -43,20 +43,20 @@ def counterparts(target: Target, image: Array) -> tuple[Indices32, Indices32, Co
 
 
 def is_seen_turned(target: Target, points: Collection[int], curves: Collection[tuple[int, int]]) -> bool:
-    """Whether a half turn about the middle of the world sends all of these points, by number, and curves, by number and
-    side, onto themselves: then nothing tells a camera from one that is turned.
+    """Return whether a half turn about the middle of the world sends all of these points, by number, and curves, by
+    number and side, onto themselves: then a camera cannot be distinguished from a turned one.
     """
     every, places = list(target.curves.values()), target.point_array[list(points)]
     if np.any(np.abs(places * TURNED - places) > _SAME_M):
         return False
-    sided = any(side and not isinstance(every[number], Arc) for number, side in curves)  # whose edges change places
+    sided = any(side and not isinstance(every[number], Arc) for number, side in curves)  # their edges change places
     return not sided and all(
         _is_along(curve, curve_points(curve, 0, _PIECES) * TURNED, curve) for curve in (every[n] for n, _ in curves)
     )
 
 
 def _is_along(curve: Curve, sent: Array, other: Curve) -> bool:
-    """Whether a curve, its places sent to (N, 3), runs all along another one, either way."""
+    """Return whether a curve, with its places sent to (N, 3), coincides with another one, in either direction."""
     as_long = type(curve) is type(other) and abs(curve.length_m - other.length_m) < _SAME_M
     return as_long and bool(np.max(distance_to_curve(other, sent)) < _SAME_M)
 
@@ -65,8 +65,8 @@ def _is_along(curve: Curve, sent: Array, other: Curve) -> bool:
 
 
 def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
-    """The turns about the upright through its middle that put the painted curves onto themselves; the first is none."""
-    counts = np.arange(12, 1, -1)  # the most first
+    """Return the turns about the vertical through its middle that keep the painted curves; the first is no turn."""
+    counts = np.arange(12, 1, -1)  # largest first
     painted = _painted(target, curves)
     middle, places = middle_of(target, curves), samples(painted)
     sent = np.array([_turn(2.0 * np.pi / count, middle).transform(places) for count in counts])
@@ -77,7 +77,7 @@ def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
 
 
 def middle_of(target: Target, curves: Collection[str]) -> Array:
-    """(3,) m: the middle of the box around the painted curves."""
+    """(3,) m, the middle of the box around the painted curves."""
     places = samples(_painted(target, curves))
     return np.asarray(0.5 * (places.min(axis=0) + places.max(axis=0)))
 
@@ -92,7 +92,7 @@ def _painted(target: Target, curves: Collection[str]) -> list[Curve]:
 
 
 def samples(curves: Collection[Curve]) -> Array:
-    """(N, 3) m, places evenly along each curve, its ends among them; a circle's outermost, too."""
+    """(N, 3) m, places evenly along each curve, including its ends and the outermost places of a circle."""
     return np.concatenate([curve_points(curve, 0, _PIECES) for curve in curves])
 
 

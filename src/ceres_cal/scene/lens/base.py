@@ -1,12 +1,12 @@
-"""What a lens model is: between the direction a ray comes from and the place where it is measured.
+"""Lens models: the map between the direction of a ray and the place where it is measured.
 
-Everything here is about one camera's optics and knows neither pose nor principal point. Rays are (N, 3) directions in
-the camera frame (x right, y down, z forward; any length), offsets are (N, 2) measured pixels from the principal point
-on a sensor with square pixels, and phi is the focal length in pixels. Where a model has no answer (behind the camera,
-past its monotone radius) the array functions return NaN.
+Everything here is about one camera's optics and is independent of pose and principal point. Rays are (N, 3) directions
+in the camera frame (x right, y down, z forward; any length), offsets are (N, 2) measured pixels from the principal
+point on a sensor with square pixels, and phi is the focal length in pixels. Where a model has no answer (behind the
+camera, past its monotone radius) the array functions return NaN.
 
-The package's own models have their map in C++ with derivatives (`kernels/core`), for the solve and for arrays; the
-paper's stands in arrays, too, as one reads it. The solve asks any other model's arrays.
+The maps of the package's own models are in C++ with derivatives (`kernels/core`), for the solve and for arrays; the
+paper's is also written for arrays, as in the paper. For any other model the solve calls its array functions.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, Indices, InputError, Mask, cached_property, no_such, replace
 
 LinearEquations = tuple[dict[str, Array], Array]
-_BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache
-# Central differences of fourth order: their own error and that of rounding are both some 1e-12 of a slope at this step.
+_BLOCK = 16384  # rows at a time, so that the data stay in the cache
+# Central differences of fourth order: at this step their own error and that of rounding are both about 1e-12 of a
+# slope.
 _STEP, _STENCIL, _WEIGHTS = 3e-4, np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
-_PLACES = np.vstack([np.zeros(3), np.kron(np.eye(3), _STENCIL[:, None])])  # the ray's, and steps along x, y and z
+_PLACES = np.vstack([np.zeros(3), np.kron(np.eye(3), _STENCIL[:, None])])  # the ray itself, and steps along x, y and z
 _DIFFERENCES = np.vstack([np.eye(13)[0], np.pad(np.kron(np.eye(3), _WEIGHTS), ((0, 0), (1, 0)))])
 
 
 def _in_blocks(function: Callable[[Array, float], Array], rows: ArrayLike, phi: float, columns: int) -> Array:
-    """A lens's map over rows of any number; NaN in the whole row where the answer is not finite."""
+    """Apply a lens's map to any number of rows; NaN in the whole row where the answer is not finite."""
     rows = np.asarray(rows, dtype=float)
     answer, ones = np.empty((len(rows), columns)), np.ones(columns)
-    with np.errstate(all="ignore"):  # what overflows or divides by zero on the way ends as NaN
+    with np.errstate(all="ignore"):  # overflows and divisions by zero end as NaN
         for start in range(0, len(rows), _BLOCK):
             block = function(rows[start : start + _BLOCK], phi)
             block[~np.isfinite(block @ ones)] = np.nan
@@ -45,22 +46,23 @@ def _in_blocks(function: Callable[[Array, float], Array], rows: ArrayLike, phi: 
 
 
 def ahead(rays: Array) -> Array:
-    """Depths (N, 1) of the rays, NaN behind the camera."""
+    """Return the depths (N, 1) of the rays, NaN behind the camera."""
     return np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
 
 
 def unit_rays(across: Array, depth: Array | float) -> Array:
-    """(N, 3) directions of unit length from their x and y (N, 2) and their z."""
+    """Return (N, 3) directions of unit length from their x and y (N, 2) and their z."""
     rays = np.column_stack([across, np.broadcast_to(depth, len(across))])
     return np.asarray(rays / np.hypot(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])[:, None])
 
 
 class Roughness(Struct, frozen=True, eq=False):
-    """A quadratic form of some coefficients that is small where the lens is smooth.
+    """A quadratic form of some coefficients that is small if the lens is smooth.
 
     Attributes:
-        names: of the coefficients. matrix: (K, K); the form over a variance, which the data tell, is prior information.
-        loose, least: standard deviations, px: before the data have spoken, and what they cannot talk below.
+        names: of the coefficients. matrix: (K, K); the form over a variance, which the data determine, is prior
+            information.
+        loose, least: standard deviations, px: before the data are used, and their lower limit.
     """
 
     names: tuple[str, ...]
@@ -71,18 +73,18 @@ class Roughness(Struct, frozen=True, eq=False):
 
 @dataclass(frozen=True)
 class Lens(ABC):
-    """A lens model with its coefficients. A kind of its own is a subclass under `register`: nothing else is to be told.
+    """A lens model with its coefficients. A new kind is a subclass with `register`: nothing else has to know it.
 
     Attributes:
         values: the coefficients, in the order of `names` and in the units of the files and reports.
-        kind: how files and options call it.
+        kind: its name in files and options.
         acts_on_pixels: whether the coefficients act on radii in pixels, not on directions.
         acts_on_tangents: whether they act on x / z and y / z, each with the power of its order.
         may_fold: whether the model may fold in a corner of the image that nobody observed.
         decentring: names of the coefficients that displace tangentially.
-        trial_powers: of the kinds that leave the choice of powers: those worth a trial, the plainest first.
-        missing_powers: of the radius that a diagnosis tries, lowest first.
-        more_terms: what it may have besides, by name, with the coefficients of each.
+        trial_powers: for kinds with a choice of powers, those worth a trial, the simplest first.
+        missing_powers: powers of the radius that a diagnosis tries, lowest first.
+        more_terms: further terms that it may have, by name, with the coefficients of each.
         set_at_start: names of numbers that say where the model, or a term of it, is defined: they are chosen, not
             solved for.
     """
@@ -118,7 +120,7 @@ class Lens(ABC):
 
     @property
     def powers(self) -> tuple[int, ...]:
-        """The powers that it was chosen by; empty where its kind leaves no choice."""
+        """The powers that were chosen; empty for a kind without a choice."""
         return ()
 
     @property
@@ -128,31 +130,31 @@ class Lens(ABC):
 
     @property
     def nodes(self) -> frozenset[str]:
-        """Those of its coefficients that say nothing one by one, of a surface."""
+        """Its coefficients of a surface, which have no meaning one by one."""
         return frozenset()
 
     @property
     def tangential(self) -> tuple[str, ...]:
-        """Those of its coefficients that displace tangentially."""
+        """Its coefficients that displace tangentially."""
         return tuple(name for name in (*self.decentring, *self.more_terms.get("tangential", ())) if name in self.names)
 
     @property
     def listed(self) -> dict[str, float]:
-        """The other coefficients."""
+        """The coefficients that are not `nodes`."""
         return {name: value for name, value in self.coefficients.items() if name not in self.nodes}
 
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Lens:
-        """The model with every coefficient 0; powers are for the kinds that leave the choice."""
+        """Return the model with every coefficient 0; powers are for kinds with a choice."""
         return cls()
 
     @property
     def names_of_terms(self) -> tuple[str, ...]:
-        """The coefficients of the terms that it has besides."""
+        """The coefficients of its further terms."""
         return _names_of_terms(type(self), self.terms)
 
     def with_terms(self, terms: Collection[str]) -> Lens:
-        """The same model with these terms besides, their coefficients 0 where it has not had them.
+        """Return the same model with these further terms; coefficients that it did not have are 0.
 
         Raises:
             InputError: its kind has no such terms.
@@ -175,7 +177,7 @@ class Lens(ABC):
         return dict(zip(self.names, self.values, strict=True))
 
     def with_values(self, values: ArrayLike) -> Lens:
-        """The same model with other coefficients."""
+        """Return the same model with other coefficients."""
         return replace(self, values=np.asarray(values, dtype=float).tolist())
 
     def distort(self, rays: ArrayLike, phi: float) -> Array:
@@ -194,9 +196,9 @@ class Lens(ABC):
 
     @abstractmethod
     def monotone_radius(self, phi: float) -> float:
-        """Measured radius (px) up to which the model is monotone and so has one answer; infinity where it always has.
+        """Return the measured radius (px) up to which the model is monotone and so has a unique answer, or infinity.
 
-        Where it is not the same all around, that of the direction in which it is least.
+        Where it depends on the direction, the least radius is returned.
         """
 
     def shows(self, offsets: Array, phi: float) -> Mask:
@@ -205,7 +207,7 @@ class Lens(ABC):
 
     @cached_property
     def lengths(self) -> tuple[int, ...]:
-        """The power of px that each coefficient's unit is; 0 of what acts on directions."""
+        """The power of px in each coefficient's unit; 0 for those that act on directions."""
         return tuple([1 - order for order in self.orders]) if self.acts_on_pixels else (0,) * len(self.names)
 
     @property
@@ -215,63 +217,63 @@ class Lens(ABC):
 
     @property
     def formula(self) -> str:
-        """The model in a line, for the report; empty where a line does not hold it."""
+        """The model in one line, for the report; empty where one line is not enough."""
         return ""
 
     @property
     def note(self) -> str:
-        """What a calibration's summary says of the coefficients; empty where they speak for themselves."""
+        """What a calibration's summary says about the coefficients; empty where they need no explanation."""
         return ""
 
     def scales(self, unit_px: float) -> Array:
-        """What to multiply each coefficient with so that it is of order one, for the solver (design, section 4)."""
+        """Return factors that bring each coefficient to order one, for the solver (design, section 4)."""
         return np.asarray(float(unit_px) ** -np.array(self.lengths, dtype=float))
 
     def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
-        """The size of each coefficient that moves a pixel `unit_px` from the middle by as much."""
+        """Return the size of each coefficient that moves a pixel `unit_px` from the middle by as much."""
         each = zip(self.lengths, self.orders, strict=True)
         return [unit_px**power if power else (unit_px / phi) ** (1 - order) for power, order in each]
 
     def spanning(self, angle: float, phi: float, beyond: float, image_size: tuple[int, int]) -> Lens:
-        """The model made for a picture of this size that is seen up to an angle, and `beyond` times as far in pixels;
-        where it was made for one before, for that.
+        """Return the model made for a picture of this size that is seen up to an angle, and `beyond` times as far in
+        pixels; a model that was made for a picture before keeps that.
         """
         return self
 
     @property
     def roughness(self) -> tuple[Roughness, ...]:
-        """What is small of a smooth lens; nothing where a formula is smooth by itself."""
+        """Quadratic forms that are small if the lens is smooth; none for a formula, which is smooth by itself."""
         return ()
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
-        """Columns by coefficient name and the right side of equations that are linear in the coefficients.
+        """Return columns by coefficient name and the right side of equations that are linear in the coefficients.
 
-        Without columns the solve starts from a lens that does not distort.
+        Without columns the solve starts from a lens without distortion.
 
         Args:
             measured: (N,) radii, px. ideal: (N,) phi times the tangent of the ray's angle to the axis, px, NaN from
-                about 90 degrees on; angle: (N,) itself.
+                about 90 degrees on. angle: (N,) that angle.
         """
         return {}, np.zeros_like(measured)
 
     def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
-        """(N, P) px by which offsets (N, 2) grow with one more term of each power, of a size of order one."""
+        """(N, P) px by which offsets (N, 2) grow with one more term of each power, with a coefficient of order one."""
         return np.asarray(unit_px * (np.hypot(offsets[:, :1], offsets[:, 1:]) / unit_px) ** powers)
 
     # ---- for the solve -----------------------------------------------------------------------------------------------
 
     @property
     def form(self) -> Array:
-        """(F,) what the compiled formulas of its kind are chosen by; nothing where there are none."""
+        """(F,) numbers that select the compiled formulas of its kind; empty where there are none."""
         return np.empty(0)
 
     def with_scaled(self, scaled: Array, unit_px: float) -> Lens:
-        """The same model with other coefficients, times their `scales`."""
+        """Return the same model with other coefficients, given as multiplied by their `scales`."""
         return self.with_values(scaled / self.scales(unit_px))
 
     def slopes_by_ray(self, rays: Array, phi: float) -> Array:
         """(N, 2, 4) offsets of rays (N, 3), px, and their derivatives by the ray's x, y and z; NaN where there is no
-        answer. By differences, to some 12 digits; a model may have formulas instead.
+        answer. They are computed by differences, to about 12 digits; a model may have formulas instead.
         """
         step = _STEP * np.sqrt(np.sum(rays * rays, axis=1))
         there = rays + step[:, None] * _PLACES[:, None]
@@ -281,8 +283,8 @@ class Lens(ABC):
         return np.ascontiguousarray(np.moveaxis(slopes, 0, 2))
 
     def slopes_by_number(self, rays: Array, phi: float, unit_px: float) -> Array:
-        """(N, 2, 1 + K) derivatives of the offsets of rays (N, 3) by phi, and by each coefficient times its scale; in
-        the same way.
+        """(N, 2, 1 + K) derivatives of the offsets of rays (N, 3) by phi, and by each coefficient times its scale,
+        computed in the same way.
         """
         steps, values = _STEP / self.scales(unit_px), np.array(self.values)
         moved = [[self.distort(rays, phi + k * _STEP * phi) for k in _STENCIL]]
@@ -298,7 +300,7 @@ def _names_of_terms(model: type[Lens], terms: tuple[str, ...]) -> tuple[str, ...
 
 
 def required_powers(kind: str, powers: Sequence[int], most: int, fewest: int = 0) -> tuple[int, ...]:
-    """The powers of a lens; InputError where they are no different whole numbers from 2 on, or too few."""
+    """Return the powers of a lens; InputError where they are not different whole numbers from 2 on, or too few."""
     whole = tuple(map(int, powers))
     distinct = len({*whole}) == len(whole) >= fewest and whole == tuple(powers)
     if not distinct or not all(2 <= power <= most for power in whole):
@@ -310,14 +312,14 @@ def required_powers(kind: str, powers: Sequence[int], most: int, fewest: int = 0
 
 _L = TypeVar("_L", bound=Lens)
 LENSES: dict[str, type[Lens]] = {}
-"""Every kind of lens, by its name: options, files, diagnosis and command line offer what is here."""
+"""Every kind of lens, by its name: options, files, diagnosis and command line offer these."""
 
 
 def register(lens: type[_L]) -> type[_L]:
-    """Add a kind of lens to the table: a decorator.
+    """Add a kind of lens to the table; this is a decorator.
 
     Raises:
-        InputError: the table has another lens of that name.
+        InputError: the table has another lens with that name.
     """
     if LENSES.setdefault(lens.kind, lens) is not lens:
         raise InputError(f"there is a lens {lens.kind!r} already: give the new one a kind of its own")
@@ -325,7 +327,7 @@ def register(lens: type[_L]) -> type[_L]:
 
 
 def lens_class(kind: str) -> type[Lens]:
-    """The model of a name.
+    """Return the lens model with a name.
 
     Raises:
         InputError: there is none.
@@ -341,11 +343,11 @@ def make_lens(
     coefficients: Mapping[str, float] | None = None,
     terms: Collection[str] = (),
 ) -> Lens:
-    """A lens by the name of its model, with the terms that are asked for or have a coefficient; coefficients that are
-    not named are 0.
+    """Return a lens by the name of its model, with the terms that are requested or have a coefficient; coefficients
+    that are not given are 0.
 
     Raises:
-        InputError: unknown kind, terms or coefficient name, or powers that make no lens.
+        InputError: an unknown kind, term or coefficient, or powers that make no lens.
     """
     given = dict(coefficients or {})
     model = lens_class(kind)

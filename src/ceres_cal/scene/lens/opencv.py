@@ -1,4 +1,4 @@
-"""Lenses as OpenCV has them: Brown's, with what was added to it, and Kannala and Brandt's, for fisheyes."""
+"""OpenCV's lenses: Brown's with its extensions, and Kannala and Brandt's, for fisheyes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _ORDERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 
 
 @dataclass(frozen=True)
 class Brown(DecentredLens):
-    """Brown's model as in OpenCV: k1 k2 p1 p2 k3 act on the ideal point (x/z, y/z), and so do, where they are asked
-    for, k4 to k6 under the line (its rational model) and s1 to s4 (its thin prism).
+    """Brown's model as in OpenCV: k1 k2 p1 p2 k3 act on the ideal point (x/z, y/z). Optional terms are k4 to k6 in the
+    denominator (OpenCV's rational model) and s1 to s4 (its thin prism).
     """
 
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -64,14 +64,14 @@ class Brown(DecentredLens):
 
     @property
     def form(self) -> Array:
-        """The places of k4 and s1 among the intrinsics, 0 for none."""
+        """The positions of k4 and s1 among the intrinsics, 0 if absent."""
         return np.array([4.0 + self.names.index(name) if name in self.names else 0.0 for name in ("k4", "s1")])
 
 
 @dataclass(frozen=True)
 class KannalaBrandt(DecentredLens):
-    """Kannala and Brandt's model as in OpenCV's fisheye: k1..k4 act on the angle from the axis, up to 180 degrees; p1
-    and p2, where they are asked for, displace tangentially, as in COLMAP's THIN_PRISM_FISHEYE.
+    """Kannala and Brandt's model as in OpenCV's fisheye: k1..k4 act on the angle from the axis, up to 180 degrees.
+    Optional p1 and p2 displace tangentially, as in COLMAP's THIN_PRISM_FISHEYE.
     """
 
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
@@ -92,7 +92,7 @@ class KannalaBrandt(DecentredLens):
 
     @staticmethod
     def _flat(rays: Array) -> Array:
-        """In the direction of the ray, as far out as its angle."""
+        """Return points in the direction of the rays, at their angles as distances."""
         across = np.hypot(rays[:, 0], rays[:, 1])
         angle = np.arctan2(across, rays[:, 2])
         stretch = np.where((across == 0.0) & (rays[:, 2] > 0.0), 1.0 / rays[:, 2], angle / across)
@@ -123,5 +123,5 @@ class KannalaBrandt(DecentredLens):
 
     @property
     def form(self) -> Array:
-        """The place of p1 among the intrinsics, 0 for none."""
+        """The position of p1 among the intrinsics, 0 if absent."""
         return np.array([8.0 if self.terms else 0.0])

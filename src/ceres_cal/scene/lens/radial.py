@@ -31,22 +31,22 @@ class Radial(Lens):
 
     Section 2 of the paper, with a1 = 1: scaling a1, a2, a3 and phi together changes nothing, so phi is the focal length
     at the centre. `powers` (2, 3) is the paper's own choice, (3,) is ssl-vision's model with a3 = distortion / phi^2.
-    The coefficient of power k is named a<k> and has the unit px^(1-k). Brown's decentring p1 and p2, where they are
-    asked for, takes the measured point to the ideal one as well, as in his own paper (Decentering Distortion of Lenses,
-    1966), by the opposite amount, so that they displace what is measured as OpenCV's do; the paper has none.
+    The coefficient of power k is named a<k> and has the unit px^(1-k). Brown's optional decentring p1 and p2 also takes
+    the measured point to the ideal one, as in his own paper (Decentering Distortion of Lenses, 1966), but with the
+    opposite sign, so that p1 and p2 displace what is measured as OpenCV's do; the paper has none.
     """
 
     powers: tuple[int, ...] = (2, 3)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "radial"
     acts_on_pixels: ClassVar[bool] = True
-    may_fold: ClassVar[bool] = False  # the paper's polynomial can be had without a fold
+    may_fold: ClassVar[bool] = False  # the paper's polynomial need not fold
     trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((3,), (2, 3), (3, 5), (2, 3, 4), (2, 3, 4, 5))
     missing_powers: ClassVar[tuple[int, ...]] = (2, 3, 4, 5, 6, 7)
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"tangential": ("p1", "p2")})
 
     def __post_init__(self) -> None:
-        most_power = 30  # 100,000 px to this power has a square that a computer holds
+        most_power = 30  # the square of 100,000 px to this power does not overflow
         object.__setattr__(self, "powers", required_powers(self.kind, self.powers, most_power, fewest=1))
         super().__post_init__()
 
@@ -78,7 +78,7 @@ class Radial(Lens):
 
     @classmethod
     def from_paper(cls, a1: float, a2: float, a3: float, phi: float) -> tuple[Radial, float]:
-        """The paper's triple with its own a1 and its phi, as (lens, phi) in the gauge a1 = 1.
+        """Return the paper's triple with its own a1 and its phi, as (lens, phi) in the gauge a1 = 1.
 
         Raises:
             InputError: a1 is not positive.
@@ -88,7 +88,7 @@ class Radial(Lens):
         return cls((a2 / a1, a3 / a1)), phi / a1
 
     def paper_coefficients(self, a1: float) -> tuple[float, ...]:
-        """(a1, a2, a3, ...) in the paper's scaling; it goes with phi * a1."""
+        """Return (a1, a2, a3, ...) in the paper's scaling, which belongs to the focal length phi * a1."""
         return (a1, *(a1 * v for v in self._along))
 
     @property
@@ -98,7 +98,7 @@ class Radial(Lens):
 
     @property
     def _across(self) -> tuple[float, float]:
-        """p1 and p2; 0 where it has none."""
+        """p1 and p2; 0 where the lens has none."""
         p1, p2 = self.values[len(self.powers) :] or (0.0, 0.0)
         return p1, p2
 
@@ -107,18 +107,18 @@ class Radial(Lens):
         """The map along a radius, lowest power first: r + sum a_k r^k."""
         return dense_polynomial(self._along, self.powers)
 
-    @lru_cache(maxsize=256)  # noqa: B019 a camera that is moved and asked anew has the lens that it had
+    @lru_cache(maxsize=256)  # noqa: B019 a camera that is moved keeps its lens
     def _profile(self, phi: float) -> Profile:
-        """That map in units of phi, in the direction in which a decentring takes most off it, 3 |p| r^2."""
+        """Return that map in units of phi, in the direction in which decentring reduces it most, by 3 |p| r^2."""
         along = dense_polynomial(self._along * phi ** np.subtract(self.powers, 1.0), self.powers)
         return ratio(less(along, np.array([0.0, 0.0, 3.0 * np.hypot(*self._across)])))
 
     def ideal_radius(self, measured_radius: ArrayLike) -> Array:
-        """r' of r, both in px (paper, section 2); no check of the monotone radius."""
+        """Return r' of r, both in px (paper, section 2); the monotone radius is not checked."""
         return horner(self._polynomial, np.asarray(measured_radius, dtype=float))
 
     def measured_radius(self, ideal_radius: ArrayLike) -> Array:
-        """r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
+        """Return r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
         ideal = np.asarray(ideal_radius, dtype=float)
         with np.errstate(all="ignore"):
             return invert_increasing(ratio(self._polynomial), ideal.ravel()).reshape(ideal.shape)
@@ -141,7 +141,7 @@ class Radial(Lens):
         return ideal
 
     def _mapped(self, flat: Array, phi: float) -> Array:
-        """(2, 3, N) ideal points of measured ones (N, 2) in units of phi, and the derivatives of that by their x, y."""
+        """(2, 3, N) ideal points of measured ones (N, 2) in units of phi, and their derivatives by these x, y."""
         (p1, p2), (x, y), radius = self._across, flat.T, phi * np.hypot(flat[:, 0], flat[:, 1])
         stretch, slope = horner(self._polynomial[1:], radius), horner(derivative(self._polynomial), radius)
         bend = np.where(radius > 0.0, (slope - stretch) / (radius / phi) ** 2, 0.0)
@@ -159,7 +159,7 @@ class Radial(Lens):
         return {name: measured**power for name, power in zip(self.names, self.powers, strict=False)}, ideal - measured
 
     def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
-        # The ideal radius grows by r^k: the measured one shrinks by the polynomial's slope.
+        # The ideal radius grows by r^k, so the measured one shrinks by r^k over the polynomial's slope.
         radius = np.hypot(offsets[:, :1], offsets[:, 1:]) / unit_px
         scaled = (np.asarray(self.values) * self.scales(unit_px))[: len(self.powers)]
         slope = 1.0 + sum(k * a * radius ** (k - 1) for k, a in zip(self.powers, scaled, strict=True))
@@ -167,5 +167,5 @@ class Radial(Lens):
 
     @property
     def form(self) -> Array:
-        """The place of p1 among the intrinsics, 0 for none, and the powers."""
+        """The position of p1 among the intrinsics, 0 if absent, and the powers."""
         return np.array([4.0 + len(self.powers) if self.terms else 0.0, *self.powers])

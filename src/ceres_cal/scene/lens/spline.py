@@ -1,4 +1,4 @@
-"""A lens without a formula: a smooth profile along the radius and a little across it, as rough as the data say."""
+"""A lens without a formula: a smooth profile along the radius and a little across it, as rough as the data require."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces
 _GRID = COLUMNS, ROWS = 16, 12  # of a surface's nodes
 EXTENTS = ("wide", "high")
 NODES = tuple(f"{axis}{i:02d}{j:02d}" for i in range(COLUMNS) for j in range(ROWS) for axis in "xy")
-"""Names of the coefficients: axis, column, row."""
-_TURNS = 48  # directions, between which nothing turns
-# Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
-# ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
+"""Names of the surface's coefficients: axis, column, row."""
+_TURNS = 48  # directions in which limits are evaluated: these vary little in between
+# Standard deviations of coefficients, in rims. Before the data are used they are loose, so that they do not hold a
+# first solve. The least ones are those of usual lenses, halved by each power, so that uninformative data do not suggest
+# a perfect lens.
 _LOOSE, _LOOSE_ACROSS, _LEAST, _LEAST_ACROSS = 1000.0, 1e-2, 0.1, 3e-3
-_BEYOND = 1.15  # of the picture, how far a surface goes: places move by less than that
+_BEYOND = 1.15  # size of a surface over the picture's: places move by less than the margin
 
 
 @cache
 def _monomials(power: int) -> Mapping[tuple[str, str], tuple[int, int]]:
-    """What displaces by a power of the radius, but for what the profile and the camera do, and Conrady's decentring:
+    """Displacements by a power of the radius, except for those of the profile, of the camera, and Conrady's decentring:
     m and n of each c q^m conj(q)^n of the complex place q, by the names of the real and the imaginary part of c.
 
-    Of power 2 there are 3 complex terms. Where nothing else bends, q^2 + q conj(q) is what a turn of the camera does
-    beside a shift of its principal point: it is left out, and Brown's decentring 2 q conj(q) c + q^2 conj(c) stays,
-    with Conrady's further terms, |q|^2 and |q|^4 times as large. Of odd powers q |q|^2k is along the radius, or a
-    twist, which no lens has.
+    Power 2 has 3 complex terms. Without other distortion, q^2 + q conj(q) is the effect of a turn of the camera beside
+    a shift of its principal point: it is left out, and Brown's decentring 2 q conj(q) c + q^2 conj(c) is kept, with
+    Conrady's further terms, |q|^2 and |q|^4 times as large. For odd powers, q |q|^2k is along the radius, or a twist,
+    which no lens has.
     """
     orders = ((power - n, n) for n in range(power + 1))
     kept = ((m, n) for m, n in orders if m - n != 1 and (power, n) not in ((2, 0), (2, 1)))
@@ -55,7 +56,7 @@ def _names(powers: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _shorter(places: Array, ends: Array) -> Mask:
-    """(N,) whether places (N, 2) lie nearer than ends (T,), of directions all around, on either side of theirs."""
+    """(N,) whether places (N, 2) are nearer than ends (T,), of even directions all around, on both sides of theirs."""
     turn = np.arctan2(places[:, 1], places[:, 0]) / (2.0 * np.pi) * len(ends)
     first = np.floor(np.nan_to_num(turn)).astype(int)
     end = np.minimum(ends[first % len(ends)], ends[(first + 1) % len(ends)])
@@ -65,12 +66,12 @@ def _shorter(places: Array, ends: Array) -> Mask:
 # ---- quintic B-splines along a radius, with value and slope 0 at the axis and straight on beyond the last knot -------
 
 INTERVALS, DEGREE = 8, 5
-COUNT = INTERVALS + DEGREE - 2  # of the B-splines: value and slope at the axis are 0
+COUNT = INTERVALS + DEGREE - 2  # number of B-splines: value and slope at the axis are 0
 END = 2.0  # rims: nothing is observed farther out
 
 
 def _b_splines(u: Array) -> Array:
-    """(N, intervals + degree) all B-splines with equal knots on [0, 1] and ends of full multiplicity (de Boor)."""
+    """(N, intervals + degree) all B-splines with equal knots on [0, 1] and end knots of full multiplicity (de Boor)."""
     inner = np.arange(INTERVALS + 1) / INTERVALS
     knots = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
     place = np.minimum((u * INTERVALS).astype(int), INTERVALS - 1) + DEGREE
@@ -99,7 +100,7 @@ def pieces() -> Array:
 
 
 def profile_columns(u: Array, derivative: int = 0) -> Array:
-    """(N, count) B-splines that are left where value and slope at 0 are 0, or a derivative; straight on beyond 1."""
+    """(N, count) B-splines that remain if value and slope at 0 are 0, or a derivative; linear beyond 1."""
     inside = np.clip(u, 0.0, 1.0)
     j = np.minimum((inside * INTERVALS).astype(int), INTERVALS - 1)
     table, t = pieces()[j], inside * INTERVALS - j
@@ -119,16 +120,16 @@ def profile_columns(u: Array, derivative: int = 0) -> Array:
 
 @cache
 def bending() -> Array:
-    """(count, count) integral of the squared fourth derivative: 0 of u^2 and u^3, which the paper's lens has, too."""
-    t = np.array([-1.0, 1.0]) / np.sqrt(3.0)  # Gauss' places, of weight 1
+    """(count, count) integral of the squared fourth derivative: 0 for u^2 and u^3, which the paper's lens has, too."""
+    t = np.array([-1.0, 1.0]) / np.sqrt(3.0)  # Gauss's nodes, of weight 1
     places = (np.arange(INTERVALS)[:, None] + 0.5 + 0.5 * t).ravel() / INTERVALS
     rows = profile_columns(places, 4)
     return np.asarray(rows.T @ rows / (2.0 * INTERVALS))
 
 
 def growing(coefficients: Array) -> Profile:
-    """The profile u + G(u) in rims, of the coefficients (count,) of G: the polynomials of the intervals, and a straight
-    line beyond the last knot; up to where it stops growing, `END` at most.
+    """Return the profile u + G(u) in rims by the coefficients (count,) of G: the polynomials of the intervals, and a
+    straight line beyond the last knot. Its limit is where it stops growing, at most `END`.
     """
     each, width = np.append(np.zeros(2), coefficients), 1.0 / INTERVALS
     own = np.array([each[j : j + DEGREE + 1] @ table for j, table in enumerate(pieces())])
@@ -142,9 +143,9 @@ def growing(coefficients: Array) -> Profile:
 
 
 def first_falls(growth: Callable[[Array], Array], directions: int = 1) -> Array:
-    """(T,) where a growth (N, T) at radii (N, T) is first not above 0 in each direction, `END` at most."""
-    refined = 8  # steps to where growth ends
-    samples = 100  # radii up to the end, between which nothing turns
+    """(T,) first radius at which a growth (N, T) at radii (N, T) is not above 0 in each direction, at most `END`."""
+    refined = 8  # steps of refinement
+    samples = 100  # radii up to the end: growth varies little in between
     places = np.linspace(0.0, END, samples + 1)
     values = growth(np.repeat(places[:, None], directions, axis=1))
     falling = values <= 0.0
@@ -165,10 +166,10 @@ def first_falls(growth: Callable[[Array], Array], directions: int = 1) -> Array:
 class Spline(Planar):
     """A quintic spline along the radius and polynomials across it.
 
-    The ideal place q is phi 2 tan(angle / 2) over `rim`, the radius (px) that the knots go up to, set at the start; it
-    is measured at rim q + G(|q|) q / |q| + sum c q^m conj(q)^n, all coefficients in px. G has value and slope 0 at the
-    axis, so that phi is the focal length there. The powers are those of the displacements across. Where it is asked
-    for, a surface (see there) is added, whose half sides, in rims, are set at the start, too.
+    The ideal place q is phi 2 tan(angle / 2) over `rim`, the radius (px) of the last knot, which is set at the start.
+    It is measured at rim q + G(|q|) q / |q| + sum c q^m conj(q)^n, with all coefficients in px. G has value and slope 0
+    at the axis, so that phi is the focal length there. The powers are those of the displacements across. An optional
+    surface (see `surface`) is added, whose half sides, in rims, are set at the start, too.
     """
 
     values: tuple[float, ...] = ()
@@ -183,7 +184,7 @@ class Spline(Planar):
     set_at_start: ClassVar[tuple[str, ...]] = ("rim", *EXTENTS)
 
     def __post_init__(self) -> None:
-        most = 9  # powers across the radius
+        most = 9  # highest power across the radius
         object.__setattr__(self, "powers", required_powers(self.kind, self.powers, most))
         object.__setattr__(self, "values", tuple(self.values) or (0.0,) * len(self.names))
         super().__post_init__()
@@ -223,10 +224,10 @@ class Spline(Planar):
     # ---- its start and its roughness ---------------------------------------------------------------------------------
 
     def spanning(self, angle: float, phi: float, beyond: float, image_size: tuple[int, int]) -> Lens:
-        steps = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
+        steps = 8  # of rims, within a factor 2: half a step is less than their margin beyond the image
         given = self.coefficients
         if given["rim"] <= 0.0:
-            # In steps, so that the numbers of two calibrations of one camera mean the same.
+            # In steps, so that the numbers of two calibrations of one camera have the same meaning.
             rim = 2.0 ** (np.rint(steps * np.log2(2.0 * phi * np.tan(0.5 * angle) * beyond)) / steps)
             given["rim"] = float(rim)
         for name, side in zip(EXTENTS, image_size, strict=True) if self.terms else ():
@@ -234,7 +235,7 @@ class Spline(Planar):
         return self.with_values(list(given.values()))
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
-        start_weight = 1e-4  # of the roughness of a start beside its equations
+        start_weight = 1e-4  # weight of a start's roughness beside its equations
         rim = self.rim_px
         u = 2.0 * phi * np.tan(0.5 * angle) / rim
         sizes, directions = np.linalg.eigh(bending())
@@ -263,7 +264,7 @@ class Spline(Planar):
 
     @property
     def rim_px(self) -> float:
-        """How far the knots go; 1 where that is not set yet."""
+        """Radius of the last knot, px; 1 where it is not set yet."""
         return self.values[0] if self.values[0] > 0.0 else 1.0
 
     def _unit(self, phi: float) -> float:
@@ -307,7 +308,7 @@ class Spline(Planar):
 
     @cached_property
     def _limits(self) -> Array:
-        """(T,) `_limit` of each direction: where nothing was observed the map may end before it does elsewhere."""
+        """(T,) `_limit` of each direction: where nothing was observed the map may end earlier than elsewhere."""
         return first_falls(self._least_growth, len(self._directions))
 
     @cached_property
@@ -339,8 +340,8 @@ class Spline(Planar):
 
     @property
     def form(self) -> Array:
-        """Where among the intrinsics Conrady's decentring and the surface are, 0 for nowhere; the B-splines' pieces on
-        each interval, by power; of each monomial the place of its coefficient, m and n.
+        """The positions among the intrinsics of Conrady's decentring and the surface, 0 if absent; the B-splines'
+        polynomials on each interval, by power; for each monomial the position of its coefficient, m and n.
         """
         names = self.names
         every = chain.from_iterable(_monomials(power).items() for power in self.powers)

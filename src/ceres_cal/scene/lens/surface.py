@@ -1,9 +1,9 @@
-"""A surface over the picture: cubic B-splines on a grid, which follow what no term of a lens does, as smooth as the
-data say (`effects/smoothness.py`).
+"""A surface over the picture: cubic B-splines on a grid, which follow what no other term of a lens does, as smooth as
+the data require (`effects/smoothness.py`).
 
-Polynomials that are long enough to do that bend where nothing was observed; here each place is displaced by the sixteen
-nodes around it, and beyond the observations by no more than a smooth continuation (thin plates; Wahba, Spline Models
-for Observational Data, SIAM 1990).
+Polynomials that are long enough for that bend where nothing was observed. Here each place is displaced by the sixteen
+nodes around it, and beyond the observations by a smooth continuation (thin plates; Wahba, Spline Models for
+Observational Data, SIAM 1990).
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import numpy as np
 from ceres_cal.base.arrays import Array, median
 
 _SPLINES = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
-# Powers of the place that other terms of the lens and the camera displace by are none of the surface's: it has a
+# Powers of the place by which other terms of the lens and the camera displace are excluded from the surface: it has a
 # thousandth of its size in them.
 _DEGREE, _WITHOUT = 3, 1e-3
 
 
 @cache
 def _products(count: int) -> tuple[tuple[Array, ...], Array]:
-    """Along one axis from -1 to 1: integrals (count, count) of products of the B-splines, of their slopes and of their
-    second derivatives; (degree + 1, count) mean products with Legendre's polynomials of root mean square 1.
+    """Along one axis from -1 to 1, return integrals (count, count) of products of the B-splines, of their slopes and of
+    their second derivatives; and (degree + 1, count) mean products with Legendre polynomials of root mean square 1.
     """
     cells = 0.5 * (count - 3)
     t, weight = np.polynomial.legendre.leggauss(5)
@@ -46,8 +46,8 @@ def _products(count: int) -> tuple[tuple[Array, ...], Array]:
 
 @lru_cache(maxsize=8)
 def roughness(wide: float, high: float, columns: int, rows: int) -> Array:
-    """(K, K) over nodes by column, row and axis: bending of the x and y displacements, each by itself, over a picture
-    of these half sides; variances of its inverse have a median of 1.
+    """(K, K) over nodes by column, row and axis: bending of the x and of the y displacements over a picture with these
+    half sides, scaled such that the variances of its inverse have a median of 1.
     """
     (across, slope_x, bend_x), moments_x = _products(columns)
     (down, slope_y, bend_y), moments_y = _products(rows)

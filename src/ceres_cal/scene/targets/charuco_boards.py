@@ -1,4 +1,4 @@
-"""ChArUco boards: checkerboards with markers in their bright squares, by which a part of one tells its corners."""
+"""ChArUco boards: checkerboards with markers in their bright squares, so that a part of one identifies its corners."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ if TYPE_CHECKING:
 def charuco(
     columns: int, rows: int, square_m: float, marker_m: float, dictionary: str, *, legacy: bool = False
 ) -> Target:
-    """The inner corners of a ChArUco board, named as those of a checkerboard: one fewer than squares each way.
+    """Return the inner corners of a ChArUco board, named as a checkerboard's: one fewer than squares in each direction.
 
     Args:
-        marker_m: side of a marker. Best at most 0.8 of a square: a corner needs some white towards the markers.
+        marker_m: side of a marker, best at most 0.8 of a square, because a corner needs some white towards the markers.
         dictionary: OpenCV's name of the markers' dictionary, such as "DICT_4X4_50".
-        legacy: made with OpenCV before 4.6, which began boards of an even number of rows of squares with a bright one.
+        legacy: whether it was made with OpenCV before 4.6, which began boards of an even number of rows of squares with
+            a bright one.
 
     Raises:
-        InputError: what `checkerboard` raises, or markers that do not fit into the squares.
+        InputError: see `checkerboard`; or markers that do not fit into the squares.
     """
     board = checkerboard(columns, rows, square_m)
     if not 0.0 < marker_m < square_m:
@@ -43,7 +44,7 @@ def charuco(
 
 
 def _shapes(grid: Grid, spec: Mapping[str, Any]) -> Iterator[Shape]:
-    """The dark squares, the dark ground of each marker, and its light cells."""
+    """Yield the dark squares, the dark ground of each marker, and its light cells."""
     board = opencv_board(spec)
     dictionary = board.getDictionary()
     corners = np.array(board.getObjPoints())[:, :, :2] - grid.spacing_m  # from the first inner corner, clockwise
@@ -60,7 +61,7 @@ def _shapes(grid: Grid, spec: Mapping[str, Any]) -> Iterator[Shape]:
 
 
 def opencv_board(spec: Mapping[str, Any]) -> cv2.aruco.CharucoBoard:
-    """The board for OpenCV; InputError for a dictionary that it does not have, or that has too few markers."""
+    """Return the board for OpenCV; InputError for a dictionary that it does not have, or that has too few markers."""
     import cv2
 
     squares = (spec["columns"] + 1, spec["rows"] + 1)
@@ -76,7 +77,7 @@ def opencv_board(spec: Mapping[str, Any]) -> cv2.aruco.CharucoBoard:
 
 
 def dictionary_of(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of that name; InputError where it has none."""
+    """Return OpenCV's dictionary of that name; raise InputError where there is none."""
     import cv2
 
     code = getattr(cv2.aruco, name, None)

@@ -1,4 +1,4 @@
-"""Targets given in full: whatever has points, segments and arcs."""
+"""Targets given in full, by points, segments and arcs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def custom(
     *,
     movable: bool = False,
 ) -> Target:
-    """A target given in full; where its curves cross, there are points besides, such as "edge*circle".
+    """Return a target given in full; crossings of its curves, such as "edge*circle", are further points.
 
     Args:
         movable: whether it is a board that somebody holds up, not the world. A flat one may be warped.
@@ -51,12 +51,12 @@ def custom(
 
 
 def of_places(points: Mapping[str, tuple[float, float, float]], *, moves: bool) -> Target:
-    """A custom target of places alone, which is a board where it moves, unless nobody can hold one so large."""
+    """Return a custom target of points only: a board if it moves, unless it is too large for anybody to hold."""
     return custom(points, movable=moves and all(hypot(*place) <= HANDY_M for place in points.values()))
 
 
 def _is_flat(points: Mapping[str, tuple[float, float, float]]) -> bool:
-    """Whether they lie on one level, and not on one line along x or y."""
+    """Return whether points lie on one level, and not on one line along x or y."""
     x, y, z = np.ptp(np.array(list(points.values())), axis=0).tolist()
     return bool(z == 0.0 and x > 0.0 and y > 0.0)
 

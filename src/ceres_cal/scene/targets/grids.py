@@ -46,7 +46,7 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
 
 
 def checkered(grid: Grid, parity: int = 0) -> Iterator[Shape]:
-    """The dark squares, one more each way beyond the outer corners: that between "0,0" and "1,1" has parity 0."""
+    """Yield the dark squares, one more on each side than corners: that between "0,0" and "1,1" has parity 0."""
     for row, column in product(range(-1, grid.rows), range(-1, grid.columns)):
         if (row + column) % 2 == parity:
             yield Shape((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
@@ -134,7 +134,7 @@ def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
 
     Args:
         columns: of tags, Kalibr's tagCols. rows: Kalibr's tagRows. Tags count from the bottom left, row by row.
-        tag_m: side of a tag's dark border, Kalibr's tagSize. gap: between tags over that, Kalibr's tagSpacing.
+        tag_m: side of a tag's dark border, Kalibr's tagSize. gap: between tags, over tag_m, Kalibr's tagSpacing.
 
     Raises:
         InputError: no tags, more than MOST_FEATURES corners, or sizes that are no positive numbers.
@@ -169,7 +169,7 @@ def tape_grid(columns: int, rows: int, pitch_m: float, line_thickness_m: float) 
 
     Args:
         columns: lines along y, at least two. rows: lines along x, at least two.
-        pitch_m: between the centres of neighbouring lines.
+        pitch_m: distance between the centres of neighbouring lines.
 
     Raises:
         InputError: fewer than two lines a way, more than MOST_FEATURES crossings, or lengths that are no positive

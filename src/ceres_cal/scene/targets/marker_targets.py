@@ -1,4 +1,4 @@
-"""ArUco and AprilTag markers of known place: each has a number, a middle, a side and a turn."""
+"""ArUco and AprilTag markers at known places: each has a number, a centre, a side and a rotation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ceres_cal.base import InputError, checked, convert
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
 CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
-"""Of a marker that is seen upright, as OpenCV has them."""
+"""Corners of a marker that is seen upright, in OpenCV's order."""
 _OFF = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 
@@ -20,8 +20,8 @@ class Marker(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, fro
     """Where a marker lies, level and with its face up.
 
     Attributes:
-        at_m: (x, y) or (x, y, z) of its middle. side_m: of its dark square, without the white around it.
-        turn_deg: by how much it is turned, counterclockwise seen from above; at 0 its right is along x.
+        at_m: (x, y) or (x, y, z) of its centre. side_m: of its dark square, without the white around it.
+        turn_deg: its rotation, counterclockwise seen from above; at 0 its right is along x.
     """
 
     at_m: tuple[float, ...]
@@ -46,7 +46,7 @@ class _MarkersSpec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=Tru
 
 @checked
 def markers(dictionary: str, places: Mapping[int, Marker], *, movable: bool = False) -> Target:
-    """The corners of markers: feature "7.top_left" and so on of marker 7, as it is seen upright.
+    """Return the corners of markers: features "7.top_left" and so on for marker 7, as it is seen upright.
 
     Args:
         dictionary: OpenCV's name of the markers' dictionary, such as "DICT_4X4_50" or "DICT_APRILTAG_36h11".
@@ -54,7 +54,7 @@ def markers(dictionary: str, places: Mapping[int, Marker], *, movable: bool = Fa
             floor.
 
     Raises:
-        InputError: no markers, more than MOST_FEATURES corners, a negative number, or a place that is none.
+        InputError: no markers, more than MOST_FEATURES corners, a negative number, or an invalid place.
     """
     if not places:
         raise InputError("markers: give at least one")

@@ -1,8 +1,8 @@
-"""Fields and courts from data files: `fields/*.json`, each made from its published rules, which it names.
+"""Fields and courts from data files: `fields/*.json`, each made from published rules, which the file names.
 
-A file gives dimensions (m) by name, parts that may be painted or not, and curves and points by expressions of them.
-"(Left|Right)GoalLine" is two curves: the first as written, the second with x mirrored; "[Top|Bottom]TouchLine" the same
-in y. Where the rules measure to an edge of a line, the file's `lengths` bring it to the line's centre.
+A file gives dimensions (m) by name, parts that may be painted or not, and curves and points by expressions of these.
+"(Left|Right)GoalLine" is two curves: the first as written, the second with x mirrored; "[Top|Bottom]TouchLine" is the
+same in y. Where the rules measure to an edge of a line, the file's `lengths` convert that to the line's centre.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ceres_cal.scene.curves import Arc, Curve, Segment, with_crossings
 from ceres_cal.scene.targets.target import FIELDS, LARGEST_M, Target, TargetKind
 
 _FUNCTIONS = {name: getattr(math, name) for name in ("acos", "asin", "atan2", "pi", "sqrt")} | {"max": max}
-TOLERANCE = "tolerance_m"  # by how much lines of a field may lie aside: of every kind, and none of its dimensions
+TOLERANCE = "tolerance_m"  # offset of a field's lines from their nominal position: of every kind, but no dimension
 _X, _Y = re.compile(r"\((\w*)\|(\w*)\)"), re.compile(r"\[(\w*)\|(\w*)\]")
 
 Expression = str | float
@@ -31,7 +31,7 @@ _Names = dict[str, Any]
 
 
 class _Variants(msgspec.Struct, forbid_unknown_fields=True):
-    """What a spec chooses by (`key`), what each is called in words, and the names of targets that exist."""
+    """The variants of a spec: `key` selects one, `words` describes it, and `names` are those of existing targets."""
 
     key: str
     words: str
@@ -74,13 +74,13 @@ class _Point(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Template(msgspec.Struct, forbid_unknown_fields=True):
-    """A field or court as its data file has it.
+    """A field or court as its data file describes it.
 
     Attributes:
-        source: the rules: document, edition, clause, and what is from memory of them. measured: to which edges.
+        source: the rules: document, edition, clause, and which of them are from memory. measured: to which edges.
         dimensions, parts: name -> value, or the value of each variant. lengths: name -> expression, in order.
-        optional: parts that a field may lack without being another one. tolerance_m: by how much its lines may lie
-            aside, where that is not as usual of its size.
+        optional: parts that a field may lack without being another one. tolerance_m: offset of its lines from their
+            nominal position, where that is not the usual one for its size.
     """
 
     kind: str
@@ -104,7 +104,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         return () if self.variants is None else tuple(dict.fromkeys(self.variants.names.values()))
 
     def target(self, variant: str | None, given: Mapping[str, float | bool]) -> Target:
-        """The field of a variant, with what is given in place of its values.
+        """Return the field of a variant, with what is given in place of the variant's values.
 
         Raises:
             InputError: an unknown variant, dimension or part, a dimension that is missing or not positive, or
@@ -168,8 +168,8 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         return {name: float(every[name]) for name in self.dimensions}
 
     def _require_metres(self, given: Mapping[str, float]) -> None:
-        """Raise InputError where most of two dimensions or more are known ones in another unit, to 2 %, or where all
-        are far larger: in inches a field is 39 times as large.
+        """Raise InputError where most of two or more dimensions are known ones in another unit, to 2 %, or where all
+        are far too large: in inches a field is 39 times as large.
         """
         least = np.inf
         for variant, (unit, many) in product(self.choices or (None,), IN_A_METRE.items()):
@@ -182,7 +182,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             raise InputError(f"{self.kind}: its dimensions are over {least:.0f} times the usual: give them in metres")
 
     def _others(self, variant: str | None, parts: Mapping[str, bool]) -> dict[str, Mapping[str, Any]]:
-        """What it may be mistaken for, in words."""
+        """Return the specs of targets for which it may be mistaken, by their names in words."""
         if self.variants is None:
             return {}
         others = [other for other in self.choices if variant not in (None, other)]
@@ -192,7 +192,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         }
 
     def from_spec(self, spec: dict[str, Any], where: str) -> Target:
-        """The target that a file describes; InputError as `target`."""
+        """Return the target that a file describes; raises InputError as `target`."""
         data = {name: value for name, value in spec.items() if name != "kind"}
         variant = None
         if self.variants is not None:
@@ -206,13 +206,13 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         return _made(self.kind, variant, tuple(given.items()))
 
     def examples(self) -> dict[str, Target]:
-        """The targets that exist, by name."""
+        """Return the targets that exist, by name."""
         if self.variants is None:
             return {self.kind.rpartition("-")[0]: _made(self.kind, None, ())}
         return {name: _made(self.kind, variant, ()) for name, variant in self.variants.names.items()}
 
     def as_kind(self) -> TargetKind:
-        """As the table of kinds has it."""
+        """Return its entry in the table of kinds."""
         dimensions = ", ".join(self.dimensions)
         given = f"{dimensions}, each in place of the rules'"
         if self.variants is not None:
@@ -229,14 +229,14 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
 
 @checked
 def painted_field(kind: str, variant: str | None = None, **given: float | bool) -> Target:
-    """A field or court by its rules, such as `painted_field("vss-field", "3v3", center_circle=False)`.
+    """Return a field or court by its rules, such as `painted_field("vss-field", "3v3", center_circle=False)`.
 
     Args:
         kind: ssl-field, vss-field, spl-field, humanoid-field, football-field, basketball-court or tennis-court:
             `ceres-cal targets` lists them, with their variants, dimensions and parts.
         variant: such as the division, where the rules have several; without it every dimension that depends on it must
             be given.
-        given: dimensions in metres, each in place of the rules', and parts that are painted (True) or not (False).
+        given: dimensions in metres that replace the rules', and parts that are painted (True) or not (False).
 
     Raises:
         InputError: unknown kind, variant, dimension or part, a dimension that is missing or not positive, or dimensions
@@ -250,7 +250,7 @@ def painted_field(kind: str, variant: str | None = None, **given: float | bool) 
 
 @checked
 def ssl_field(division: str | None = None, **given: float | bool) -> Target:
-    """A field of the RoboCup small-size league, its lines, circle, corners and crossings under the league's names.
+    """Return a field of the RoboCup small-size league: its lines, circle, corners and crossings by the league's names.
 
     Lines are named as in the league's geometry message (and lie where ssl-vision puts them); the message names no
     points, so those are named after the lines that meet there. All distances are between line centres (league rules,
@@ -270,11 +270,11 @@ def ssl_field(division: str | None = None, **given: float | bool) -> Target:
 
 @cache
 def templates() -> dict[str, Template]:
-    """Kind -> its template; that of the small-size league first."""
+    """Return kind -> its template; that of the small-size league first."""
     return {kind: msgspec.json.decode(path.read_bytes(), type=Template) for kind, path in FIELDS.items()}
 
 
-@lru_cache(maxsize=256)  # the same ones are asked for again and again: what a dimension moves, in every photograph
+@lru_cache(maxsize=256)  # the same targets are needed repeatedly: what a dimension moves, in every photograph
 def _made(kind: str, variant: str | None, given: tuple[tuple[str, float | bool], ...]) -> Target:
     return templates()[kind].target(variant, dict(given))
 
@@ -292,7 +292,7 @@ def _compiled(expression: str) -> Any:
 
 
 def _value(expression: Expression, names: _Names) -> float:
-    """Of an expression in one of the package's own files."""
+    """Return the value of an expression in one of the package's own files."""
     if not isinstance(expression, str):
         return float(expression)
     return float(eval(_compiled(expression), {"__builtins__": {}}, names))
@@ -304,7 +304,7 @@ def _place(at: tuple[Expression, Expression], names: _Names, mirror: tuple[int, 
 
 
 def _painted(every: Mapping[str, Any], parts: Mapping[str, bool]) -> Iterator[tuple[str, tuple[int, int], Any]]:
-    """Name, signs of x and y, and shape of all that is painted."""
+    """Yield name, signs of x and y, and shape of everything that is painted."""
     for pattern, shape in every.items():
         if not all(parts[part] for part in shape.parts):
             continue

@@ -1,4 +1,4 @@
-"""The paper's concentric circles on a sheet."""
+"""Sheets with the paper's concentric circles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ceres_cal.scene.targets.target import Paper, Shape, Target, TargetKind, fro
 
 @checked
 def rings(radii_m: Sequence[float]) -> Target:
-    """The paper's concentric circles (section 2): edges "ring_1", "ring_2", ... from the inside out, point "centre".
+    """Return the paper's concentric circles (section 2): edges "ring_1", "ring_2", ... outwards, and point "centre".
 
     Raises:
         InputError: no radius, or radii that do not increase from above 0.
@@ -29,7 +29,7 @@ def rings(radii_m: Sequence[float]) -> Target:
 
 
 def _shapes(radii: Sequence[float], border: float) -> Iterator[Shape]:
-    """From the outside in, each on the one before; beyond the last of an even number of rings it is dark, too."""
+    """Yield discs from the outside in, each on the one before; outside an even number of rings it is dark, too."""
     if len(radii) % 2 == 0:
         yield Shape((-border, -border), 2.0 * border)
     for number in reversed(range(len(radii))):

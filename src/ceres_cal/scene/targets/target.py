@@ -1,7 +1,7 @@
-"""What a target is: a rigid thing of known geometry with named points and named curves; and what a kind of them is.
+"""Targets: rigid things of known geometry with named points and named curves; and what a kind of target is.
 
-What a printed target looks like: its sheet of paper, and what is on it. The table of the kinds, and the target that a
-file describes.
+Also the appearance of a printed target (its sheet of paper, and what is on it), the table of the kinds, and the target
+that a file describes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve, along_track
 
 
 class Shape(Struct, frozen=True):
-    """A square by its corner of the least x and y, and its side, m, or a disc by its centre and radius.
+    """A square, by its corner with the least x and y and its side, m, or a disc, by its centre and radius.
 
-    A light one lies on a dark one.
+    A light shape lies on a dark one.
     """
 
     place_m: tuple[float, float]
@@ -39,7 +39,7 @@ class Paper(Struct, frozen=True, eq=False):
 
     Attributes:
         low_m, high_m: (x, y) of two opposite corners of the sheet.
-        shapes: what is printed, in this order, on white.
+        shapes: yields what is printed, in this order, on white.
     """
 
     low_m: tuple[float, float]
@@ -48,24 +48,24 @@ class Paper(Struct, frozen=True, eq=False):
 
 
 MOST_FEATURES = 100_000
-"""Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
+"""Largest number of points and curves of all targets of a file: ten boards of 100 x 100 corners."""
 
 
 WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
-"""What the warp of a board is made of: see `Target.bends`."""
+"""Components of a board's warp: see `Target.bends`."""
 STRETCH = ("stretch.x", "stretch.y")
-"""Along its columns and along its rows, as printers stretch a board: see `Target.bends`."""
+"""Stretch of a board along its columns and along its rows, as by printers: see `Target.bends`."""
 LARGEST_M = 1e7
-"""Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
+"""Upper limit of a target's numbers, more than the Earth's radius. Products of four such numbers keep their meaning."""
 
 
-HANDY_M = 50.0  # of a target that somebody holds before a camera, from its origin
+HANDY_M = 50.0  # from its origin: largest reach of a target that somebody holds before a camera
 PAINT_WANDERS = 0.2
-"""Of `Target.usual_aside_m`: by how much lines wander about where they are drawn, tape by 3 to 8 mm of 9 m."""
+"""Share of `Target.usual_aside_m` by which lines wander about their drawing: tape by 3 to 8 mm on 9 m."""
 
 
 def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
-    """Raise InputError where a point or a curve of a target has numbers that cannot be."""
+    """Raise InputError where a point or a curve of a target has impossible numbers."""
     once_round = 2.0 * np.pi * (1.0 + 1e-6)  # people round
     for name, place in points.items():
         if not np.all(np.abs(place) < LARGEST_M):
@@ -90,7 +90,7 @@ class Grid(Struct, frozen=True):
     """Points at even distances in columns (along x) and rows (along y), listed row by row.
 
     Attributes:
-        checkered: whether they are where the squares of a checkerboard meet, which `detect.boards` finds.
+        checkered: whether they are the corners of a checkerboard's squares, which `detect.boards` finds.
     """
 
     columns: int
@@ -100,22 +100,23 @@ class Grid(Struct, frozen=True):
 
 
 class Target(Frozen):
-    """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
+    """A rigid thing of known geometry, in its own frame, in metres; a field's frame is the world.
 
     Attributes:
-        spec: what a file says of it, `{"kind": ..., ...}`; two targets are equal when their specs are, whether they
-            move or not, and their features come in the same order (observations number them).
+        spec: its description in a file, `{"kind": ..., ...}`; two targets are equal if their specs are, whether they
+            move or not, and if their features come in the same order (observations number them).
         points: name -> (x, y, z) m.
         curves: name -> Segment or Arc.
-        movable: whether it lies where somebody put it; what is not movable is the world.
+        movable: whether somebody places it; what is not movable is the world.
         bows: whether it is a board that may be bent or stretched: then a tolerance may have a warp.
-        grid: how its points stand in columns and rows; None where they do not.
+        grid: arrangement of its points in columns and rows; None where there is none.
         paper: the sheet that it is printed on; None for what is painted on the floor.
-        mistaken_for: in words -> spec of another target, most of whose features have the same names.
-        dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
-            spec its features lie elsewhere.
-        optional: names of curves that go together and that a field may lack without being another one.
-        tolerance_m: by how much its lines may lie aside, where it says so; else as is usual of its size.
+        mistaken_for: description in words -> spec of another target, most of whose features have the same names.
+        dimensions: the lengths, m, that its spec gives or implies, by their names there; another value in the spec
+            moves features.
+        optional: groups of curve names, each of which a field may lack as a whole without being another one.
+        tolerance_m: offset of its lines from their nominal position, where it states one; None: the usual one for its
+            size.
     """
 
     spec: Mapping[str, Any]
@@ -132,7 +133,7 @@ class Target(Frozen):
 
     def __post_init__(self) -> None:
         require_places(self.kind, self.points, self.curves)
-        if self.movable and self.reach_m > HANDY_M:  # boards alone fit in any unit
+        if self.movable and self.reach_m > HANDY_M:  # only boards fit in any unit
             raise InputError(
                 f"{self.kind}: it reaches {self.reach_m:.0f} m from its origin, and nobody holds that before a camera: "
                 "give its dimensions in metres, or with their unit, such as 25mm"
@@ -161,7 +162,7 @@ class Target(Frozen):
 
     @cached_property
     def point_index(self) -> Mapping[str, int]:
-        """The number of each point, by its name and by those of the crossing that lies there: see `crossings`."""
+        """The number of each point, by its name and by the names of a crossing at its place: see `crossings`."""
         index = {name: number for number, name in enumerate(self.points)}
         return index | {alias: index[name] for alias, name in aliases(self.points, self.curves).items()}
 
@@ -181,7 +182,7 @@ class Target(Frozen):
 
     @cached_property
     def tracks(self) -> Array:
-        """(3, C, 3, 3): for side 0, +1 and -1 (index it with the side itself) the track of each curve."""
+        """(3, C, 3, 3) track of each curve for side 0, +1 and -1; the side itself is the index."""
         return np.array(
             [[curve.track(side) for curve in self.curves.values()] for side in (0, 1, -1)], dtype=float
         ).reshape(3, -1, 3, 3)
@@ -193,21 +194,21 @@ class Target(Frozen):
 
     @cached_property
     def evenly(self) -> tuple[Array, Array]:
-        """(C, 241) parameters evenly along each curve, from end to end, and (C, 241, 3) m the places there."""
+        """(C, 241) parameters evenly along each curve, from end to end, and (C, 241, 3) m their places."""
         low, high = np.array([curve.parameter_range for curve in self.curves.values()]).reshape(-1, 2).T
         s = np.ascontiguousarray(np.linspace(low, high, 241, axis=1))
         return s, along_track(self.tracks[0][:, None], self.is_arc[:, None], s)
 
     @cached_property
     def places(self) -> Array:
-        """(P, 3) m: its points, and where its curves begin."""
+        """(P, 3) m: its points, and the beginnings of its curves."""
         return np.concatenate([self.point_array, self.tracks[0, :, 0] + self.tracks[0, :, 1]])
 
     @cached_property
     def bends(self) -> Array:
-        """(P, W + 3) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a
-        side, x (1 - x^2) and y (1 - y^2) with 1 as their largest, and 1 for a height; then its places along x and y
-        from the middle, over its longer side. 0 where it does not bow.
+        """(P, W + 3) deformations of a board, with x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y, the
+        odd terms along a side, x (1 - x^2) and y (1 - y^2), scaled to a maximum of 1, and 1 for a height; then its
+        places along x and y from the middle, over its longer side. They are 0 where it does not bow.
         """
         if not self.bows or not self.points:
             return np.zeros((len(self.points), len(WARP) + 1 + len(STRETCH)))
@@ -222,7 +223,7 @@ class Target(Frozen):
 
     @property
     def reach_m(self) -> float:
-        """How far the farthest of `places` lies from its origin."""
+        """Distance from its origin to the farthest of `places`, m."""
         return float(np.max(np.linalg.norm(self.places, axis=1), initial=0.0))
 
     @property
@@ -232,8 +233,8 @@ class Target(Frozen):
 
     @property
     def usual_aside_m(self) -> float:
-        """By how much a curve lies aside that does: as it states, or as people lay out what is so large; 0 without."""
-        aside = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
+        """Offset of a curve that is off its nominal position, m: as stated, or usual for its size; 0 without paint."""
+        aside = 4.2  # factor on the geometric mean of the line's width and a thousandth of the field's length
         widths = [self.curves[name].width_m for name in self.painted]
         if self.tolerance_m or not widths:
             return self.tolerance_m or 0.0
@@ -248,14 +249,14 @@ class Target(Frozen):
 
 
 def _farthest(curve: Curve) -> Array:
-    """Parameters of a curve's ends, and of where an arc runs along x or y."""
+    """Return the parameters of a curve's ends, and of the places where an arc is parallel to x or y."""
     low, high = curve.parameter_range
     turns = 0.5 * np.pi * np.arange(np.ceil(low / (0.5 * np.pi)), high / (0.5 * np.pi))
     return np.array([low, *(turns if isinstance(curve, Arc) else ()), high])
 
 
 def from_arguments(kind: str, make: Callable[..., Target]) -> Callable[[dict[str, Any], str], Target]:
-    """`TargetKind.from_spec` of a kind whose spec gives the arguments of the function that makes its targets."""
+    """Return `TargetKind.from_spec` of a kind whose spec has the arguments of the function that makes its targets."""
 
     @cache
     def form() -> type[msgspec.Struct]:
@@ -278,10 +279,10 @@ class TargetKind(Struct, frozen=True):
     """A kind of target: all that the package knows of it.
 
     Attributes:
-        name: as files have it. what, parameters, features: for people, what it is, what a file gives, how its features
+        name: in files. what, parameters, features: texts for people: what it is, what a file gives, how its features
             are named.
-        examples: makes targets by name. One that is not named like its kind exists in the world, such as ssl-a, and may
-            be asked for by that name.
+        examples: returns targets by name. A target with another name than its kind's exists in the world, such as
+            ssl-a, and can be used by that name.
         from_spec: makes the target that a file describes; the text names the place in messages. Raises InputError.
     """
 
@@ -295,7 +296,7 @@ class TargetKind(Struct, frozen=True):
 
 _FIELDS = sorted(Path(__file__).parent.glob("fields/*.json"), key=lambda path: (path.stem != "ssl-field", path))
 FIELDS = {path.stem: path for path in _FIELDS}
-"""Files of painted fields, by the kinds that they describe; that of the small-size league first."""
+"""Files of painted fields, by the kinds that they describe; the small-size league's first."""
 _MODULES = {
     **dict.fromkeys(FIELDS, "painted_fields"),
     **dict.fromkeys(("tape-grid", "checkerboard", "circle-grid", "april-grid"), "grids"),
@@ -308,11 +309,11 @@ TARGET_KINDS: LazyTable[TargetKind] = LazyTable("ceres_cal.scene.targets", _MODU
 
 
 def target_from_spec(spec: Any, where: str) -> Target:
-    """The target that a file describes.
+    """Return the target that a file describes.
 
     Args:
         spec: `{"kind": ..., ...}`.
-        where: how to name the place in messages, such as 'obs.json: target "field"'.
+        where: name of the place in messages, such as 'obs.json: target "field"'.
 
     Raises:
         InputError: unknown kind, or a description that does not fit its kind.
@@ -327,7 +328,7 @@ def target_from_spec(spec: Any, where: str) -> Target:
 
 
 def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, Target]:
-    """The targets that a file describes, by name; InputError as `target_from_spec`, or where they are too large."""
+    """Return the targets of a file, by name; raises InputError as `target_from_spec`, or where they are too large."""
     targets: dict[str, Target] = {}
     for name, spec in specs.items():
         targets[name] = target_from_spec(spec, f"{where}target {name!r}")
@@ -337,7 +338,7 @@ def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, T
 
 
 def still(targets: Mapping[str, Target]) -> dict[str, Target]:
-    """Those that lie in the world, as a field does."""
+    """Return the targets that lie in the world, as a field does."""
     return {name: target for name, target in targets.items() if not target.movable}
 
 
@@ -353,18 +354,18 @@ def require_features(target: Target, points: Iterable[str] = (), curves: Iterabl
 
 
 def target_named(name: str) -> Target | None:
-    """One of `targets_by_name`, without making the others; None where there is none of the name."""
+    """Return one of `targets_by_name`, without making the others; None where there is none with that name."""
     every = (kind.examples() for kind in TARGET_KINDS.values() if name != kind.name)
     return next((examples[name] for examples in every if name in examples), None)
 
 
 def targets_by_name() -> dict[str, Target]:
-    """The targets of any kind that exist in the world, such as ssl-a."""
+    """Return the targets of any kind that exist in the world, such as ssl-a."""
     every = ((kind, *example) for kind in TARGET_KINDS.values() for example in kind.examples().items())
     return {name: target for kind, name, target in every if name != kind.name}
 
 
 def others_of_kind(target: Target) -> dict[str, Target]:
-    """Those of them that are of a target's kind, as the field of the other division, but for itself."""
+    """Return the other existing targets of a target's kind, such as the field of the other division."""
     kind = TARGET_KINDS[target.spec["kind"]]
     return {name: one for name, one in kind.examples().items() if name != kind.name and one.spec != target.spec}
