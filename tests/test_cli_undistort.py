@@ -1,6 +1,8 @@
 """undistort, and reports with photographs, as someone types them."""
 
+import errno
 import json
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -193,6 +195,12 @@ def test_reports_with_photographs(say: Say, folder: Path, tmp_path: Path) -> Non
     assert '<section id="photographs"' in page.read_text(encoding="utf-8")
 
 
+def _full_disk(_: int, target: Path) -> None:
+    """A disk that has room for a calibration but not for a page."""
+    if target.suffix == ".html":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def test_photographs_that_do_not_belong(say: Say, folder: Path, tmp_path: Path) -> None:
     wrong = tmp_path / "other.png"
     cv2.imwrite(str(wrong), np.zeros((48, 64), np.uint8))
@@ -205,5 +213,12 @@ def test_photographs_that_do_not_belong(say: Say, folder: Path, tmp_path: Path) 
     assert said.out.startswith("This calibration ")
     why = f"{tmp_path / 'shot.png'}: 64 x 48 px, but camera 'camera' has 1280 x 960"
     assert f"\nerror     no report: {why}" in said.out
+    (tmp_path / "folder.html").mkdir()
+    page = ("--report", tmp_path / "folder.html" / "page.html", "-o", tmp_path / "d.json")
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr("ceres_cal.base.files._keep_owner", _full_disk)
+        said = say("calibrate", folder / "obs.json", *page, "--quiet")
+    assert said.code == 1 and (tmp_path / "d.json").exists() and not page[1].exists()
+    assert said.out.endswith(f"\nerror     no report: {page[1]}: cannot be written: No space left on device\n")
     assert "--images needs --report" in refused(say("calibrate", folder / "obs.json", "--images", wrong))
     assert not (tmp_path / "page.html").exists()

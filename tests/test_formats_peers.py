@@ -62,6 +62,48 @@ def test_ros_by_its_fields_and_opencv(lens: str, tmp_path: Path) -> None:
     assert (loss.image_px[1] == 0.0) == (lens != "radial-3")
 
 
+def test_ros_as_its_message_is_echoed(tmp_path: Path) -> None:
+    """By `rostopic echo` (D, K) and `ros2 topic echo` (d, k), one message after another; and lists in a file."""
+    path, camera = tmp_path / "info.yaml", with_lens("brown")
+    export(over_field(camera), "ros", path)
+    data = yaml.safe_load(path.read_text())
+    k, d = (data[name]["data"] for name in ("camera_matrix", "distortion_coefficients"))
+    sizes = {"height": data["image_height"], "width": data["image_width"], "distortion_model": "plumb_bob"}
+    echoed = [
+        yaml.safe_dump({"header": {"seq": 0, "frame_id": "left"}, **sizes, **names}) + "---\n"
+        for names in ({"D": d, "K": k, "R": [0.0] * 9, "P": [0.0] * 12}, {"d": d, "k": k})
+    ]
+    listed = yaml.safe_dump({**data, "camera_matrix": k, "distortion_coefficients": d})
+    for text in (echoed[0], 2 * echoed[1], "---\n" + echoed[0], listed):
+        path.write_text(text)
+        (back,) = import_calibration(path).cameras.values()
+        assert back.phi == pytest.approx(k[4], rel=1e-12)
+        assert list(back.lens.coefficients.values()) == pytest.approx(d, rel=1e-12)
+    path.write_text(yaml.safe_dump({**sizes, "D": d}))
+    with pytest.raises(InputError, match="it has no camera_matrix with rows, cols and data, or as a list"):
+        import_calibration(path)
+
+
+@pytest.mark.parametrize(
+    "topics, names",
+    [
+        (("/stereo/left/image_raw", "/stereo/right/image_raw"), ["left", "right"]),
+        (("/left/image_raw", "/right/image_raw"), ["left", "right"]),
+        (("/camera/image_raw", "/camera/image_raw"), ["cam0", "cam1"]),
+    ],
+)
+def test_kalibrs_cameras_are_called_by_what_tells_their_topics_apart(
+    topics: tuple[str, str], names: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "chain.yaml"
+    export(two_cameras(PLAIN_BROWN), "kalibr", path)
+    data = yaml.safe_load(path.read_text())
+    for entry, topic in zip(data.values(), topics, strict=True):
+        entry["rostopic"] = topic
+    path.write_text(yaml.safe_dump(data))
+    assert list(import_calibration(path).stations) == names
+
+
 @pytest.mark.parametrize("lens", [PLAIN_BROWN, KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)), Radial((6e-7,), (3,))])
 def test_kalibr_by_its_chain_and_opencv(lens: Lens, tmp_path: Path) -> None:
     both = two_cameras(lens)

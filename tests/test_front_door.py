@@ -1,5 +1,6 @@
 """From arrays to a calibration and back in a few lines, as someone types them who knows OpenCV."""
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -65,6 +66,14 @@ def test_what_are_no_photographs(given: Any) -> None:
     """Pixels, or images that were read, given to `check` ended in a ValueError of NumPy."""
     with pytest.raises(InputError, match=r"photographs are named by their files, not given as \w+; of pixels"):
         image_files(given)
+
+
+def test_a_field_is_named_as_on_the_command_line() -> None:
+    photograph = Path(__file__).resolve().parents[1] / "data" / "ssl_field" / "photographs" / "0001.jpg"
+    found = ceres_cal.detect_field(photograph, "ssl-b", facing={"LeftGoalLine": "top"})
+    assert found.observations.targets["field"] == ssl_field("B")
+    with pytest.raises(InputError, match="there is no target 'ssl-c': did you mean 'ssl-b'"):
+        ceres_cal.detect_field(photograph, "ssl-c")
 
 
 def test_names_from_arrays_are_text() -> None:

@@ -8,14 +8,14 @@ from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 from ceres_cal import detect, moves, start
 from ceres_cal.base import ImageProgress, Images, InputError, checked, image_files, images_and_videos, no_such
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
 from ceres_cal.observations import Observations, Prior, combine
-from ceres_cal.scene import Camera, Target
+from ceres_cal.scene import Camera, Target, target_named, targets_by_name
 
 if TYPE_CHECKING:
     from ceres_cal.problem.bundle import SolveProgress
@@ -59,7 +59,7 @@ def detect_board(
 @checked
 def detect_field(
     images: Images | Callable[[], Images],
-    target: Target | None = None,
+    target: Target | str | None = None,
     start: Calibration | Camera | detect.Clicks | Mapping[str, tuple[float, float]] | None = None,
     *,
     auto: bool = False,
@@ -79,8 +79,8 @@ def detect_field(
 
     Args:
         images: photographs that one camera took at one station, or a function that returns them, which is called after
-            all other arguments were checked. target: the field, such as `ssl_field("B")`; by default that of the
-            calibration to start from.
+            all other arguments were checked. target: the field, such as `ssl_field("B")` or "ssl-b"; by default that of
+            the calibration to start from.
         start: where the camera was before, or four or more named points with their approximate pixels. Without a start
             the field is found in the photograph.
         auto: whether to find the field also where a calibration is given as start, however far the camera has moved.
@@ -115,6 +115,8 @@ def detect_field(
     if start is None or auto:
         before = None if start is None or not isinstance(posed, Camera) else posed
         posed = detect.Auto(tuple(detect.Facing(*one) for one in sides.items()), before)
+    if isinstance(target, str):
+        target = target_named(target) or _no_target(target)
     if target is None:
         raise InputError("target is missing: name the field, such as ssl_field('B')")
     painted = lines_to_find(target, sides, not_painted, estimate)
@@ -132,6 +134,10 @@ def detect_field(
         posed.require_names(target)
     paths = image_files(images() if callable(images) else images)
     return detect.detect_field(paths, target, posed, painted, options, progress)
+
+
+def _no_target(name: str) -> NoReturn:
+    raise InputError(no_such("target", name, targets_by_name()))
 
 
 def lines_to_find(

@@ -42,5 +42,6 @@ def _run(
     # Wrong labels that were taken out do no harm, and noise is estimated.
     against = [finding for finding in diagnosis.findings if strict or report.is_against(finding)]
     answer = tuple(report.diagnosis_sections(diagnosis, choices, solved.options))
-    sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))
-    return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)
+    unwritten, written = files.write_results(args, diagnosis.table.save, page)
+    doubtful = against or diagnosis.conflicts or unmade.data or unwritten.data
+    return Document((*answer, unmade, unwritten, written), 1 if doubtful else 0)

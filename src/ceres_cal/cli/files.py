@@ -234,17 +234,19 @@ def save(path: Path, made: Any) -> None:
             made.save(path)
 
 
-def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> Section:
-    """Write the output by `save`, and the page of the report if there is one; the section names the files."""
-    report = None if page is None else args.report
+def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> tuple[Section, Section]:
+    """Write the output by `save`, and the page of the report if there is one. The first section says why the report
+    could not be written (see `attempted`), the second names the files.
+    """
+    report, unwritten = None if page is None else args.report, Section()
     with finishing():
         if args.output is not None:
             save(args.output)
         if page is not None and report is not None:
-            base.write_bytes(report, page.encode())
-    paths = {"output": args.output, "report": report}
+            _, unwritten = attempted("report", partial(base.write_bytes, report, page.encode()))
+    paths = {"output": args.output, "report": None if unwritten.data else report}
     named = {name: None if path is None else str(path) for name, path in paths.items()}
-    return Section("written", [path for path in named.values() if path is not None], named)
+    return unwritten, Section("written", [path for path in named.values() if path is not None], named)
 
 
 def attempted(what: str, make: Callable[[], T]) -> tuple[T | None, Section]:
@@ -320,5 +322,5 @@ def calibrated(
     """
     page, unmade = report_page(args, calibration, observations, photographs)
     answer = report.calibration_sections(report.quality_of(calibration, observations), names)
-    written = write_results(args, calibration.save, page)
-    return Document((*before, *answer, unmade, written), 1 if unmade.data else 0)
+    unwritten, written = write_results(args, calibration.save, page)
+    return Document((*before, *answer, unmade, unwritten, written), 1 if unmade.data or unwritten.data else 0)

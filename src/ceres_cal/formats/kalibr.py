@@ -6,7 +6,7 @@ src https://github.com/ethz-asl/kalibr/wiki/yaml-formats.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,19 +48,27 @@ def _read(request: ImportRequest) -> Any:
     names = sorted((key for key in data if key[:3] == "cam" and key[3:].isdigit()), key=lambda key: int(key[3:]))
     if not names or names != [f"cam{n}" for n in range(len(names))]:
         raise InputError(f"its cameras must be cam0, cam1, ..., not {', '.join(map(str, data)) or 'none'}")
+    if wrong := [key for key in names if not isinstance(data[key], dict)]:
+        raise InputError(f"{wrong[0]} must have camera_model, intrinsics, ...")
     cameras: dict[str, ForeignCamera] = {}
     pose: Pose | None = None
-    for key in names:
+    for key, name in zip(names, _camera_names(data, names), strict=True):
         entry = data[key]
-        if not isinstance(entry, dict):
-            raise InputError(f"{key} must have camera_model, intrinsics, ...")
         if "T_cn_cnm1" in entry:
             pose = _pose(entry, key) @ (pose or Pose.identity())
         elif key != "cam0":
             raise InputError(f"{key} has no T_cn_cnm1: where it stands is not said")
-        name = str(entry.get("rostopic") or key).strip("/").split("/")[0]
-        cameras[key if name in cameras else name] = _camera(entry, key, pose)
+        cameras[name] = _camera(entry, key, pose)
     return calibration_of("a Kalibr camchain", cameras)
+
+
+def _camera_names(data: Mapping[str, Any], keys: Sequence[str]) -> Sequence[str]:
+    """Return the first part of the topics that differs between all cameras, such as left and right of
+    /stereo/left/image_raw and /stereo/right/image_raw; the keys if there is none.
+    """
+    topics = [str(data[key].get("rostopic") or key).strip("/").split("/") for key in keys]
+    parts = zip(*topics, strict=False)  # as far as the shortest reaches
+    return next((part for part in parts if len(set(part)) == len(keys)), keys)
 
 
 def _pose(entry: Mapping[str, Any], key: str) -> Pose:

@@ -6,6 +6,7 @@ src ros-perception/image_common camera_calibration_parsers/src/parse_yml.cpp.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -17,6 +18,8 @@ from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
 
+_ECHOED = {"width": "image_width", "height": "image_height", "k": "camera_matrix", "d": "distortion_coefficients"}
+"""Names in the message itself, as `rostopic echo` and `ros2 topic echo` print it: names in a file of the parsers."""
 _MODELS = {"opencv5": "plumb_bob", "opencv8": "rational_polynomial", FISHEYE: "equidistant"}
 
 
@@ -54,7 +57,9 @@ def _matrix(values: Array) -> dict[str, Any]:
 
 
 def _read(request: ImportRequest) -> Any:
-    data = read_yaml(request.text)
+    first = next(filter(str.strip, re.split(r"(?m)^---.*$", request.text)), "")  # of messages that were echoed
+    echoed = read_yaml(first)
+    data = {_ECHOED.get(name.lower(), name): value for name, value in echoed.items()}
     sizes = [data.get(name) for name in ("image_width", "image_height")]
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise InputError(f"image_width and image_height must be whole numbers above 0, not {sizes}")
@@ -73,8 +78,10 @@ def _read(request: ImportRequest) -> Any:
 
 def _values(data: Mapping[str, Any], name: str, count: int | None) -> Array:
     entry = data.get(name)
+    if isinstance(entry, list):
+        return numbers_at(entry, name, count)
     if not isinstance(entry, dict):
-        raise InputError(f"it has no {name} with rows, cols and data")
+        raise InputError(f"it has no {name} with rows, cols and data, or as a list")
     return numbers_at(entry.get("data"), f"{name}.data", count)
 
 
@@ -88,7 +95,8 @@ def _pose(data: Mapping[str, Any]) -> Pose | None:
 
 
 def _recognises(content: bytes) -> bool:
-    return b"distortion_model" in content and b"cols" in content and b"opencv-matrix" not in content
+    others = (b"opencv-matrix", b"camera_model")  # OpenCV's and Kalibr's
+    return b"distortion_model" in content and not any(mark in content for mark in others)
 
 
 FORMATS = (

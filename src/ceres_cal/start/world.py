@@ -11,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base import DegenerateError, Frozen, InputError, Pose, Poses, SolutionError, chained, inverted, replace
 from ceres_cal.base.arrays import Array, Indices, distinct, evenly
-from ceres_cal.base.words import plural
+from ceres_cal.base.words import first_of, plural
 from ceres_cal.observations import Prior, Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
@@ -313,7 +313,7 @@ def _require_all(
         if key.station in stations and key.placement in placements:
             continue
         sight = sights[number]
-        frames = ", ".join(repr(sights.observations.views[i].frame) for i in sight.views[0][:3])
+        frames = first_of(list(dict.fromkeys(repr(sights.observations.views[i].frame) for i in sight.views[0])))
         said = f"{plural(len(sight.point_rows), 'point')} and {plural(len(sight.curve_rows), 'curve observation')} (on "
         said += f"{plural(len(distinct(sight.track_index)), 'curve')}) cannot fix its pose"
         if names := open_numbers.get(number, ()):
