@@ -88,7 +88,7 @@ class CachedCost(CostFunction):
         with self._run:
             charts = [self.charts.get(owner) for owner in self.owners]
             blocks = [chart.numbers(one) if chart else one for chart, one in zip(charts, parameters, strict=True)]
-            at = np.concatenate(blocks)
+            at = np.concatenate(blocks) if len(blocks) > 1 else blocks[0].copy()
             # Ceres asks for the cost of a step first, then for the Jacobian at the same point: one evaluation is
             # enough.
             if self._known is None or self._known.at.tobytes() != at.tobytes():
@@ -345,9 +345,9 @@ _Coordinates = Callable[[Array], tuple[Array, Array]]
 
 def _linear(slots: Sequence[int], scales: Array, size: int) -> _Coordinates:
     """Coordinates that are numbers of the block itself, times scales."""
-    slopes = np.zeros((len(slots), size))
-    slopes[np.arange(len(slots)), slots] = scales
-    return lambda block: (block[slots] * scales, slopes)
+    slopes, places = np.zeros((len(slots), size)), np.array(slots, dtype=np.int64)
+    slopes[np.arange(len(slots)), places] = scales
+    return lambda block: (block[places] * scales, slopes)
 
 
 def _of_station(rows: Sequence[int], rotation: Array) -> _Coordinates:
@@ -374,7 +374,8 @@ class PriorCost(CachedCost):
         super().__init__(run)
         self._prior, self._root = prior, prior.information.root
         parts = list(_parts(prior, estimate, layout))
-        self._coordinates = [(columns, coordinates) for _, _, columns, coordinates in parts]
+        whole = list(range(len(prior.keys)))  # a slice of it takes no copy
+        self._coordinates = [(slice(None) if columns == whole else columns, there) for _, _, columns, there in parts]
         self._take({owner: size for owner, size, _, _ in parts}, len(self._root))
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Sequence
+from functools import cache, partial
 
 import numpy as np
 
@@ -102,23 +102,29 @@ def search(
     """
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves, auto, strokes)
-    result = _search_about(problem)
+
+    @cache
+    def shown() -> str:
+        """The name of another target that the picture shows, "" of none."""
+        others = others_of_kind(target).items()
+        return next((name for name, one in others if not problem.is_out_of_time and _shows(problem, one)), "")
+
+    result = _search_about(problem, shown)
     if result.followed is not None:
         return result
-    for name, other in others_of_kind(target).items():
-        if not problem.is_out_of_time and _shows(problem, other):
-            return replace(result, reason=OTHER.format(name), shows=name)
+    if name := shown():
+        return replace(result, reason=OTHER.format(name), shows=name)
     moved = off_centre(problem)
     if moved is problem:
         return result
-    about = _search_about(moved)
+    about = _search_about(moved, shown)
     return about if about.followed is not None else result
 
 
-def _search_about(problem: FieldSearch) -> SearchResult:
-    """Search with one assumed centre of the lens."""
+def _search_about(problem: FieldSearch, shown: Callable[[], str]) -> SearchResult:
+    """Search with one assumed centre of the lens; the second search is left out where another target is `shown`."""
     good, seen, reason = _looked(problem, problem)
-    if not good:
+    if not (good or shown()):
         good, other, against = _looked(problem, narrowed(problem))
         if seen is None or (other is not None and other.share > seen.share):
             seen, reason = other, against
