@@ -203,14 +203,20 @@ def _where_likely(case: Case, every: EffectColumns) -> Iterator[EffectColumns]:
     if not changes:
         return
     best = max(changes, key=lambda change: change.statistic)
+
+    def is_likely(scatter: float, freedom: float) -> bool:
+        ratio, rank = best.statistic / (scatter * best.rank), best.rank
+        return bool(log_f_tail(*map(np.array, ([ratio], [rank], [freedom])))[0] < np.log(rate / len(changes)))
+
+    if not is_likely(1.0, float(every.columns.shape[1] * len(every.subjects))):  # however well frames agree
+        return
     beside = case.model.with_columns(best.columns)
     single = score_all(beside, [EffectSums.of(beside, replace(every, onwards=False))], by_chance=False)
     freedom = float(sum(one.rank for one in single)) - 2.0 * best.rank
     if freedom < 1.0:
         return
     scatter = max(sum(one.statistic for one in single) / freedom, 1.0)
-    log_p = log_f_tail(np.array([best.statistic / (scatter * best.rank)]), np.array([best.rank]), np.array([freedom]))
-    if log_p[0] < np.log(rate / len(changes)):
+    if is_likely(scatter, freedom):
         after = np.where(every.group < 0, -1, (every.group > best.number).astype(np.int64))
         names = (every.frames[best.number], every.frames[-1])
         yield replace(every, group=after, subjects=every.subjects[:2], frames=names)
