@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from ceres_cal.base import Frozen, cached_property, replace
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, evenly, median, numbers_of
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, evenly, median, numbers_of
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene import Camera, nearest_to_rays
 
@@ -400,7 +400,8 @@ def shown_rows(sights: Sights) -> Mask:
 def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """Return the names of the frames that show anything, and (N + M,) the number of each observation's frame."""
     views = column_of(observations, "view")
-    names = dict.fromkeys(observations.views[int(view)].frame for view in distinct(views))
+    shown = np.flatnonzero(np.bincount(views)).tolist()
+    names = dict.fromkeys(observations.views[view].frame for view in shown)
     order = {name: number for number, name in enumerate(names)}
     return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
 
