@@ -91,7 +91,8 @@ def detect_field(
             line.
         points: whether to measure corners and crossings, too, where the lines lead to. keep_start: the start is
             accurate to 12 px.
-        camera: its name in the observations, by default that of the calibration, or "camera". station: likewise.
+        camera: its name in the observations, by default that of the calibration, or "camera". station: its name there,
+            by default that of the calibration, or the camera's.
         refused: called with the path of each image that does not show the field, and what was seen in it.
         progress: called after each image with (steps done, steps in all, file name).
 

@@ -1,4 +1,4 @@
-"""The result of a calibration, how it came about, and its file."""
+"""The result of a calibration, how it was obtained, and its file."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -137,7 +137,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
 
 def _measured(observations: Observations, options: Options, progress: SolveProgress | None, client: Any) -> Calibration:
     """Calibrate, with the dimensions of targets and the noise of cameras as they were found; repeat from there where
-    they differ from what was assumed. Very large data sets, of which a subset decides, keep their noise.
+    they differ from what was assumed. Very large data sets, of which a subset decides, have one noise.
     """
     # A dimension may differ from its drawing by this share without another solve; beyond it the start and the outliers
     # are those of a wrong drawing. And the largest number of such solves.
@@ -214,7 +214,7 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
     little, loose = loosely(observations, free)
     if not options.closed_form_only and (little, loose) != (observations, options):
         asked = replace(task, stated=(observations, options))
-        # quiet: there are too few observations without what is stated, here and after the start
+        # quiet: without the statements the observations are too few, here and after the start
         start = attempt(partial(initialise, sights, _named(free)))
         if isinstance(start, Start):
             little_said = replace(sights, observations=little)
@@ -224,7 +224,7 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
             if free is options:
                 return _of_lens_asked(task, start, sights, options)
         elif free is options or isinstance(start, InputError):
-            raise start  # there is no other
+            raise start  # there is no other start
     return as_asked()
 
 

@@ -1,4 +1,4 @@
-"""The result: calibrated cameras, stations and placements, and how they came about."""
+"""The result: calibrated cameras, stations and placements, and how they were obtained."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Calibration(Frozen):
 
     @property
     def lens_choice(self) -> LensChoice | None:
-        """How the lens of the first camera was chosen; None where it was given."""
+        """The choice of the first camera's lens; None where the lens was given."""
         return next(iter(self.lens_choices.values()), None)
 
     @property
@@ -136,7 +136,7 @@ class Calibration(Frozen):
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
-        """How well everything is known: verdicts, weak directions, maps in mm.
+        """The uncertainty of everything: verdicts, weak directions, maps in mm.
 
         Raises:
             InputError: nothing was minimised, or the file has no posterior.
@@ -148,7 +148,7 @@ class Calibration(Frozen):
         return Uncertainty(self.estimate, self.posterior, self.targets, self.conflicts)
 
     def disagreement(self, observations: Observations, first: str, second: str) -> Disagreement:
-        """How far two stations disagree about what both observed, in the observations of this calibration.
+        """Return the disagreement of two stations about what both observed, in the observations of this calibration.
 
         Raises:
             InputError: there is no posterior, see `uncertainty`; or these are other observations.

@@ -70,7 +70,7 @@ class TriedLens(Frozen, eq=True):
 
 
 class LensChoice(Frozen, eq=True):
-    """Which lens was chosen, over what, and by how much.
+    """The choice of a lens, with the lenses that it was compared with.
 
     Attributes:
         chosen: its label. tried: every lens that was compared, the chosen one first, the others by prediction error.
@@ -106,7 +106,7 @@ class LensChoice(Frozen, eq=True):
 
 
 class Fit(Frozen, eq=True):
-    """How well the observations fit.
+    """Statistics of the residuals and of the noise.
 
     Attributes:
         points, curves: numbers of observations that took part.
@@ -161,7 +161,7 @@ _Q = TypeVar("_Q")
 
 
 class RefitRecord(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unknown_fields=True):
-    """How a calibration was derived from an earlier one.
+    """The record of a refit: how a calibration was derived from an earlier one.
 
     Attributes:
         what: what was free, one of `moves.WHAT`. moved: stations whose poses were solved for.

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 
 class Task(Frozen):
-    """How a problem is solved, and who is informed.
+    """Settings of a solve: its steps, its callbacks, and prior results.
 
     Attributes:
         progress: called at each iteration. settle: where the observations are a subset, solves for all of them from the
@@ -89,7 +89,7 @@ class TaskSolution(Frozen):
     """The solution of a task, and what explains the observations that it does not fit.
 
     Attributes:
-        explanations: what else groups of observations may be. as_built: how targets were built.
+        explanations: other explanations of groups of observations. as_built: how targets were built.
         beside: effects of the table that were solved for. others: further minima.
         unsteady: displacements of single views. digest: of the observations, which cache it; computed in a thread.
     """
@@ -286,7 +286,7 @@ def known_of(seen: TaskSolution) -> Calibration:
 
 
 def _made_steady(first: TaskSolution, problem: Problem) -> TaskSolution | None:
-    """Subtract displacements of single views and solve again as in the first solve; None where there are none.
+    """Subtract displacements of single views and solve, twice, with those found last; None where there are none.
 
     They are sought before groups are tested for being outliers, because they displace groups, and again afterwards,
     because in few views the target as built hides them. The lens keeps its length: a lens that grew beside them
@@ -329,7 +329,7 @@ def _explained(first: TaskSolution, drawn: Sights, built: Construction) -> TaskS
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
         return solve_robustly(others, _start_of(others, some, first), task.scales)
 
-    # These solves start with lenses about as smooth as the data say. Explanations are judged without held smoothness.
+    # These solves start with lenses about as smooth as the data say; the problem that is returned leaves that open.
     smooth = replace(first.problem, smoothness=first.end.problem.smoothness)
     end, explanations = compete(smooth, first.end, solved) if task.knows else (first.end, ())
     seen = replace(first, problem=replace(smooth, sights=drawn), end=end, explanations=explanations)

@@ -66,7 +66,7 @@ class FieldDifference(ErrorMap):
 
     @property
     def known_mm(self) -> float:
-        """Root mean square of what is expected, where anything is; infinite where it is unknown everywhere."""
+        """Root mean square of the expected standard deviations, where known; infinite where none is known."""
         return rms(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm), np.inf)
 
 
@@ -226,7 +226,7 @@ def matched(calibration: Calibration, observations: Observations) -> Observation
 
     Raises:
         InputError: a camera that the calibration does not have, a station of another camera, or observations outside
-            of their image.
+            their image.
         SolutionError: images of another size, or a target of other dimensions.
     """
     observations = calibration.as_taken(observations)
@@ -331,7 +331,7 @@ class NormalDistribution(Frozen):
 
 
 class Contrast(Frozen):
-    """How much the least squared distance to two statements falls when some numbers may differ between them.
+    """The fall of the least squared distance to two statements when some numbers may differ between them.
 
     Attributes:
         statistic: that fall. shares: (D,) the first statement's share of the variance of each direction that both

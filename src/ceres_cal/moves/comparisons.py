@@ -1,5 +1,5 @@
-"""Where two calibrations differ, on the field and over the image, by how much their cameras' poses differ, and whether
-their uncertainties explain the differences.
+"""The differences of two calibrations: on the field, over the image, between the cameras' poses, and whether their
+uncertainties explain them.
 """
 
 from __future__ import annotations

@@ -201,7 +201,7 @@ def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Pose
 
 
 class RefitVerdict(Frozen, eq=True):
-    """How a solved refit agrees with what was known before.
+    """The agreement of a solved refit with what was known before.
 
     Attributes:
         strain: squared distance of intrinsics, structure and stations that stay from their prior, in its sigmas.

@@ -1,4 +1,4 @@
-"""What of an old calibration is used for the next one: its estimate as a start, its posterior as a prior.
+"""The use of an old calibration for the next one: its estimate is the start, its posterior a prior.
 
 Also the same observations under other names: of a field turned by half a turn, mirrored, or of other dimensions.
 """

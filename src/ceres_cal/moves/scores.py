@@ -1,4 +1,4 @@
-"""How well cameras explain observations that they were not calibrated from: intrinsics held, poses solved for."""
+"""Scores of cameras on observations that they were not calibrated from: intrinsics held, poses solved for."""
 
 from __future__ import annotations
 

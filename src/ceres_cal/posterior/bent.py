@@ -1,4 +1,4 @@
-"""Where the cost is not quadratic: along phi, and at the ends of weak directions.
+"""Deviations of the cost from a quadratic form: along phi, and at the ends of weak directions.
 
 Views of a flat field from nearly above determine phi by small differences of large numbers, so the least cost is a
 long, bent valley that no ellipse describes (the profile likelihood). The valley is followed step by step; at each node
@@ -186,7 +186,7 @@ _FARTHEST = 4.0  # factor on the distance by normal equations: what is flatter t
 
 
 class Ends(Frozen):
-    """Where the numbers are at the ends of weak directions.
+    """The numbers at the ends of weak directions.
 
     Attributes:
         keys: (K). steps: (2 B, K) to the ends of the 95 % interval along each of B directions by the quadratic model,

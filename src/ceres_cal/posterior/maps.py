@@ -152,7 +152,7 @@ class ErrorMap(FieldGrid, ABC):
 
 
 class FieldMap(ErrorMap):
-    """How well one station locates points at one height, over a grid.
+    """Accuracy of the points that one station locates at one height, over a grid.
 
     Attributes:
         sd_mm, radius_95_mm: (Y, X) as in `PointSpread`; NaN where the image does not show the place, infinite where it
@@ -225,7 +225,7 @@ class ImageMap(Frozen):
 
 
 class Picture(Frozen):
-    """What a camera shows at N pixels, and how that changes with another camera.
+    """The rays of a camera at N pixels, and the pixels at which other cameras show them.
 
     Attributes:
         weights: (N,) of the pixels in the turn that is subtracted; 0: no turn is subtracted.

@@ -63,7 +63,7 @@ class OtherLenses(Frozen):
 
 
 class OpenDirection(NamedTuple):
-    """How numbers (K) vary with one number of a camera, by one standard deviation of that number."""
+    """The variation of numbers (K) with one number of a camera, by one standard deviation of that number."""
 
     along: Key
     keys: tuple[Key, ...]
@@ -319,7 +319,7 @@ class LensResiduals(Frozen):
 
     @property
     def in_rings(self) -> float:
-        """The same for sums over rings about the principal point, of radial residuals of points; largest of cameras."""
+        """Like `in_cells`, over rings about the principal point and for radial residuals; the largest of cameras."""
         rings = 24  # from the middle to the farthest observation
         agree = 0.0
         for name, camera in self.cameras.items():

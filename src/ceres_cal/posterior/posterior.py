@@ -1,4 +1,4 @@
-"""What a calibration knows of its own numbers, stored as information and read as standard deviations."""
+"""The posterior of a calibration's numbers, stored as information and read as standard deviations."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Posterior(Frozen):
             return shifts
         stated = self.stated.over(self.keys)
         moved = np.concatenate([self.information.beside(stated, shift[None]) for shift in shifts])
-        with np.errstate(invalid="ignore"):  # of what is stated nearly alone, all of it is rounding
+        with np.errstate(invalid="ignore"):  # if nearly all of it is stated, this is rounding
             room = np.sqrt(np.maximum(np.nan_to_num(self.stated_sd**2 - self.spread.sd**2, nan=np.inf), 0.0))
         return np.asarray(np.clip(moved, -room, room))
 

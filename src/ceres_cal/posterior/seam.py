@@ -146,7 +146,7 @@ class Disagreement(Frozen):
 
 
 class _Sighting(Frozen):
-    """What one station observed of one point or stretch of a curve, averaged over all frames.
+    """One station's observations of one point or stretch of a curve, averaged over all frames.
 
     Attributes:
         place: (3,) m, as drawn. off_m: (2,) mean displacement of the located place from that.

@@ -1,4 +1,4 @@
-"""How well a calibration is known, for people: numbers with verdicts, weak directions in words, maps, rigs.
+"""The uncertainty of a calibration, for people: numbers with verdicts, weak directions in words, maps, rigs.
 
 A number is known, weak or unknown by its standard deviation in natural sizes; a direction, by how large a change along
 it goes unnoticed.
@@ -39,7 +39,7 @@ _TOGETHER = 0.1
 
 
 class Verdict(Frozen, eq=True):
-    """What is known of one number.
+    """The uncertainty of one number, with a verdict.
 
     key: the number. value: in the key's unit; 0 for a turn, which is relative to the pose.
     sd: root mean square deviation, infinite where unknown; where phi is followed along its profile, half the distance
@@ -146,7 +146,7 @@ class Uncertainty(Frozen):
             (columns.get((one.owner, one.quantity, one.unit)), one) for one in self.conflicts if one.kind == "prior"
         ]
         stated = {i: one.stated for i, one in named if i is not None and _is_set_aside(one, float(values[i]))}
-        if not stated or self.posterior.followed:  # along a valley all of it is one answer
+        if not stated or self.posterior.followed:  # a whole valley is one answer
             return self
         off = every.steps[:, [*stated]]
         nearer = np.abs(off) < np.abs(off + values[[*stated]] - [*stated.values()])

@@ -1,4 +1,4 @@
-"""A camera: image size, intrinsics, lens and pose, the maps between world, rays and pixels, and how files have it.
+"""A camera: image size, intrinsics, lens and pose, the maps between world, rays and pixels, and its form in files.
 
 Pixel (0, 0) is the centre of the top-left pixel. The camera frame has x right, y down, z forward,
 and x_cam = R (x_world - t) with t the camera's position (paper, section 3).
@@ -127,7 +127,7 @@ class Camera(Frozen, eq=True):
         return np.array([[self.phi, self.skew * self.phi, cx], [0.0, self.phi * self.aspect, cy], [0.0, 0.0, 1.0]])
 
     def at(self, cam_from_world: Pose) -> Camera:
-        """The same camera at another pose."""
+        """Return the same camera at another pose."""
         return replace(self, cam_from_world=cam_from_world)
 
     @property
@@ -160,7 +160,7 @@ class Camera(Frozen, eq=True):
         x, y = rows(pixels, 2, "pixels").T
         cx, cy = self.principal_point
         down = (y - cy) / self.aspect
-        return np.column_stack([x - cx - self.skew * down, down])  # by columns: rows of two are slow to walk
+        return np.column_stack([x - cx - self.skew * down, down])  # by columns: NumPy is slow on rows of two
 
     def project(self, points_world: ArrayLike) -> Array:
         """Points (N, 3) m -> pixels (N, 2), or one (3,) -> (2,); NaN behind the camera or past the lens's monotone

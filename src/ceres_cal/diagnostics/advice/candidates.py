@@ -73,7 +73,7 @@ def together(parts: Sequence[Measurement], words: str) -> Measurement:
 
 
 class Ground(Frozen):
-    """What a measurement would add to.
+    """The present knowledge, to which a measurement is added.
 
     Attributes:
         estimate: of everything. keys: (P) its free numbers. targets: as drawn.

@@ -27,7 +27,7 @@ _MUST_LEAVE = 0.9
 
 
 class Promise(Frozen):
-    """What one measurement would achieve.
+    """The result that one measurement promises.
 
     Attributes:
         after: the errors that it leaves, if everything is as estimated.

@@ -125,7 +125,7 @@ class Lens(ABC):
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Those of `more_terms` that it has."""
+        """Its terms, among `more_terms`."""
         return ()
 
     @property

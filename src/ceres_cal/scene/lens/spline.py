@@ -56,7 +56,7 @@ def _names(powers: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _shorter(places: Array, ends: Array) -> Mask:
-    """(N,) whether places (N, 2) are nearer than ends (T,), of even directions all around, on both sides of theirs."""
+    """(N,) whether places (N, 2) are nearer than the ends (T,) of both neighbouring directions, evenly all around."""
     turn = np.arctan2(places[:, 1], places[:, 0]) / (2.0 * np.pi) * len(ends)
     first = np.floor(np.nan_to_num(turn)).astype(int)
     end = np.minimum(ends[first % len(ends)], ends[(first + 1) % len(ends)])

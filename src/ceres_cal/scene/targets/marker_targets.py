@@ -17,7 +17,7 @@ _OFF = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 
 class Marker(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
-    """Where a marker lies, level and with its face up.
+    """The place of a marker that lies level, with its face up.
 
     Attributes:
         at_m: (x, y) or (x, y, z) of its centre. side_m: of its dark square, without the white around it.
