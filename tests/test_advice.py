@@ -367,7 +367,7 @@ def test_words_are_what_is_meant() -> None:
         if measurement.kind == "pole":
             for step, target in zip(measurement.steps, measurement.targets.values(), strict=True):
                 x, y, z = target.points["top"]
-                assert f"({x:.2f}, {y:.2f} m), its top {z:.2f} m over the field" in step
+                assert f"({x:.2f}, {y:.2f} m), its top {z:.2f} m above the field" in step
                 assert "on " not in step or FIELD.points[step.split()[1]] == (x, y, 0.0)
         if measurement.kind != "board":
             continue
@@ -375,7 +375,7 @@ def test_words_are_what_is_meant() -> None:
         for step, pose in zip(measurement.steps, measurement.placements.values(), strict=True):
             middle = pose.transform(board.point_array).mean(axis=0)
             away = middle - camera.position
-            found = re.search(r"pixel \((\d+), (\d+)\), ([\d.]+) m from .* by (\d+) deg, its (\w+) edge", step)
+            found = re.search(r"pixel \((\d+), (\d+)\), ([\d.]+) m from .* by (\d+) deg with its (\w+) edge", step)
             assert found is not None
             assert camera.project(middle[None])[0] == pytest.approx([float(found[1]), float(found[2])], abs=1e-6)
             assert np.linalg.norm(away) == pytest.approx(float(found[3]), abs=0.005)
@@ -412,7 +412,7 @@ def test_advice_needs_a_field_a_station_and_an_uncertainty() -> None:
     scene = PROBLEMS["whole field, 8 deg"]().scene
     alone = board_scene(checkerboard(9, 6, 0.1), scene.cameras, scene.stations, count=8, seed=1)
     seen = simulate(alone, Disturbance(points_sigma_px=0.3), 1).observations
-    with pytest.raises(InputError, match="advice is about a map of a field, and there is none"):
+    with pytest.raises(InputError, match="advice needs the map of a field"):
         advise(calibrate(seen, RADIAL))
 
 

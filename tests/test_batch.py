@@ -213,7 +213,7 @@ def test_ctrl_c_leaves_what_is_done_and_no_process(tmp_path: Path) -> None:
     os.killpg(run.pid, signal.SIGINT)  # as a terminal does: to all of them
     _, error = run.communicate(timeout=20)
     assert run.returncode == 130 and first.startswith("good"), (first, error)
-    assert error.startswith("ceres-cal: interrupted: written were ") and error.count("\n") == 1
+    assert error.startswith("ceres-cal: interrupted: files written: ") and error.count("\n") == 1
     done = remembered(to)
     assert 0 < len(done) < 40 and all(one.level != "failed" for one in done.values())
     for _ in range(50):  # Python's own tracker of resources ends when it sees that nobody is left

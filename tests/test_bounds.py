@@ -40,10 +40,10 @@ def with_moved(rows: int, pixel: tuple[float, float]) -> Observations:
 @pytest.mark.parametrize(
     "size, change, words",
     [
-        ((640, 480), lambda p: p, "but image_size is 640 x 480: another image size?"),
+        ((640, 480), lambda p: p, "but image_size is 640 x 480: give the size of the pictures"),
         ((960, 1280), lambda p: p, "but image_size is 960 x 1280: width and height, or x and y, are swapped"),
         ((1280, 960), lambda p: p[:, ::-1], "but image_size is 1280 x 960: width and height, or x and y, are swapped"),
-        ((1280, 960), lambda p: 2.0 * p, "but image_size is 1280 x 960: another image size?"),
+        ((1280, 960), lambda p: 2.0 * p, "but image_size is 1280 x 960: give the size of the pictures"),
         ((1280, 960), lambda p: p * (1.0, -1.0), "but (0, 0) is the centre of the top-left pixel"),
         ((1280, 960), lambda p: p - (640.0, 480.0), "but (0, 0) is the centre of the top-left pixel"),
     ],
@@ -105,7 +105,7 @@ def test_a_detection_may_lie_one_pixel_beyond_the_edge(pixel: tuple[float, float
 def test_each_camera_has_its_own_image() -> None:
     both = simulate(SCENES["brown/two-cameras"](), Disturbance(0.3, 0.3)).observations
     assert both.require_inside() == ()
-    with pytest.raises(InputError, match=r"^camera 'east': .* image_size is 1000 x 960: another .* the first is view"):
+    with pytest.raises(InputError, match=r"^camera 'east': .* image_size is 1000 x 960: give .* the first is view"):
         replace(both, cameras=dict(both.cameras) | {"east": (1000, 960)}).require_inside()
     larger = replace(both, cameras=dict(both.cameras) | {"east": (2000, 2000)})
     assert larger.require_inside() == ()

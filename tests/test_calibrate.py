@@ -589,7 +589,7 @@ def test_what_agrees_with_no_camera_is_not_called_too_few() -> None:
     seen = corners_at(lambda p: np.arange(len(p)) < 9)
     pixels = seen.points.pixels.copy()
     pixels[::2] = np.minimum(pixels[::2, ::-1], 950.0)
-    with pytest.raises(DegenerateError, match="others agree with no camera: check the names of features, and whether"):
+    with pytest.raises(DegenerateError, match="no camera explains the others of the"):
         calibrate(replace(seen, points=replace(seen.points, pixels=pixels)))
 
 
@@ -603,9 +603,12 @@ def fourth_board_with(*rows: int) -> Observations:
 @pytest.mark.parametrize(
     "observations, message",
     [
-        (lambda: corners_at(lambda p: np.arange(len(p)) < 3), r"'0001'.*3 points.*phi of the camera stay open: add"),
+        (
+            lambda: corners_at(lambda p: np.arange(len(p)) < 3),
+            r"'0001'.*3 points.*phi of the camera are not determined: add",
+        ),
         (lambda: corners_at(lambda p: np.arange(len(p)) < 5), "10 measured numbers.*cannot determine 11 unknowns: add"),
-        (lambda: corners_at(lambda p: p[:, 1] == 0.0), "8 points.*cannot fix its pose: .*y.* stay open"),
+        (lambda: corners_at(lambda p: p[:, 1] == 0.0), "8 points.*cannot fix its pose: .*y.* are not determined"),
         (lambda: lines_named("HalfwayLine"), "station 'overhead'.*29 curve observations.*cannot fix its pose"),
         (
             lambda: lines_named("TopTouchLine", "CenterLine", "BottomTouchLine"),
@@ -657,7 +660,7 @@ def test_cameras_that_can_do_without_one_are_counted() -> None:
     few = lines_named("HalfwayLine")
     (camera,), views = few.cameras.values(), tuple(replace(one, camera="end", station="end") for one in few.views)
     both = corners_at(lambda p: p[:, 0] > -9.0) + replace(few, cameras={"end": camera}, views=views)
-    with pytest.raises(DegenerateError, match=r"'end'.*fix its pose.*1 other camera can be calibrated without .*'end'"):
+    with pytest.raises(DegenerateError, match=r"'end'.*fix its pose.*1 other camera can be calibrated if .*'end'"):
         calibrate(both, RADIAL)
 
 
@@ -817,7 +820,7 @@ def test_the_sample_field_comes_back() -> None:
 
 @pytest.mark.parametrize(
     ("aspect", "words"),
-    [(1.0, ("", "", "")), (0.93, ("fx comes out as 0.926", "fx comes out as 0.930", "fx comes out as 0.930"))],
+    [(1.0, ("", "", "")), (0.93, ("fx is estimated as 0.926", "fx is estimated as 0.930", "fx is estimated as 0.930"))],
 )
 def test_pixels_that_may_not_be_square_are_said_to(aspect: float, words: tuple[str, ...]) -> None:
     """At 35 degrees square pixels with another phi suit a picture that was stretched, to 3 % of the noise."""

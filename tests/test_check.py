@@ -138,7 +138,7 @@ def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
     observations = lines(HOME, 4)
     shuffled = np.random.default_rng(0).permutation(observations.curves.feature)
     found = check(calibration, replace(observations, curves=replace(observations.curves, feature=shuffled)))
-    assert not found.holds and "not understood" in found["overhead"].words
+    assert not found.holds and "cannot be explained" in found["overhead"].words
     mirrored = relabelled(observations, MIRRORED)  # two thirds of it look the same: the camera is where it was
     assert mirrored is not None
     found = check(calibration, mirrored)
@@ -160,7 +160,7 @@ def test_another_zoom_or_focus_is_named(calibration: Calibration) -> None:
 def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibration) -> None:
     without = replace(calibration, targets={})
     for pose, words in (
-        (HOME, "holds: no change beyond what is known (probability"),
+        (HOME, "holds: no change beyond the uncertainty (probability"),
         (SMALL_TILT, "deg (probability"),
     ):
         found = check(without, lines(pose, 1))["overhead"]

@@ -371,7 +371,9 @@ def test_one_verdict_on_the_screen_in_json_and_in_the_report(say: Say, tmp_path:
 def test_a_wrong_prior_is_said_by_every_command(say: Say, tmp_path: Path) -> None:
     out = tmp_path / "calibration.json"
     text = say("calibrate", SAMPLE, "-o", out, "--prior", "height_m=3:0.005").out
-    assert "warning   the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 4.02" in text
+    assert (
+        "warning   the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone give 4.02" in text
+    )
     assert "verdict   Do not trust this calibration: the observations contradict what was stated beforehand." in text
     diagnosed = say("diagnose", out, SAMPLE, "--json")
     (conflict,) = json.loads(diagnosed.out)["conflicts"]
@@ -657,7 +659,7 @@ def _pickled() -> bytes:
         ("corners.csv", b"frame,point,x_px,y_px\n0,A,1,2\n", "`ceres-cal import` makes them of a CSV file"),
         ("bad.json", b"[1, 2]", '"format" must be'),
         ("bad.npz", _pickled(), "is missing"),
-        ("bad.npz", SAMPLE.read_bytes(), "no NPZ file"),
+        ("bad.npz", SAMPLE.read_bytes(), "not an NPZ file"),
     ],
 )
 def test_bad_files(say: Say, tmp_path: Path, name: str, content: bytes, words: str) -> None:
@@ -960,7 +962,7 @@ def test_detect_board_without_one(say: Say, photos: Path, tmp_path: Path) -> Non
     assert "no board of 5 x 4" in refused(say("detect", "board", photos / "none.png", *BOARD, "-o", out))
     assert "no such file" in refused(say("detect", "board", photos / "c*.png", *BOARD, "-o", out))
     assert "not an image" in refused(say("detect", "board", photos / "notes.txt", *BOARD, "-o", out))
-    assert "no images in this folder" in refused(say("detect", "board", ROOT / "data", *BOARD, "-o", out))
+    assert "this folder contains no images" in refused(say("detect", "board", ROOT / "data", *BOARD, "-o", out))
     assert ".json or .npz" in refused(say("detect", "board", photos, *BOARD, "-o", tmp_path / "o.csv"))
     assert "--charuco needs --marker" in refused(
         say("detect", "board", photos, *BOARD, "-o", out, "--charuco", "DICT_4X4_50")

@@ -115,7 +115,7 @@ def test_ctrl_c_says_what_is_written(say: Say, folder: Path, monkeypatch: pytest
     monkeypatch.setattr(ProgressBar, "update", interrupt)
     out = folder / "interrupted"
     line = refused(say("undistort", folder / "c.json", folder / "in", "-o", out), code=130)
-    assert line == f"ceres-cal: interrupted: written were {out / 'shot-straight.png'}\n"
+    assert line == f"ceres-cal: interrupted: files written: {out / 'shot-straight.png'}\n"
     assert [path.name for path in out.iterdir()] == ["shot-straight.png"]
 
 

@@ -141,7 +141,7 @@ def test_sign_of_the_homography_puts_points_before_the_camera(pose: Pose) -> Non
     "plane, message",
     [
         ([(0, 0), (1, 0), (0, 1)], "3 points cannot fix a plane's pose: give at least four"),
-        ([(0, 0), (1, 2), (2, 4), (3, 6), (-1, -2)], "all 5 points lie on one line: add points beside it"),
+        ([(0, 0), (1, 2), (2, 4), (3, 6), (-1, -2)], "all 5 points lie on one line: add points off this line"),
         ([(1, 1)] * 6, "all 6 points lie on one line"),
         ([(0, 0), (1, 0), (2, 0), (0.3, 1.2)], "three"),  # section 3.5: no one of them on a line connecting other two
     ],

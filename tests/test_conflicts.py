@@ -82,7 +82,7 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
     assert conflict.sigmas == pytest.approx((conflict.seen - 3.0) / np.hypot(0.005, conflict.seen_sd), rel=0.15)
     assert conflict.words in wrong().warnings
     assert conflict.words == (
-        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.970 ± 0.053 m, "
+        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone give 3.970 ± 0.053 m, "
         "16 sigmas apart: correct or remove it"
     )
 
@@ -178,7 +178,7 @@ def test_nothing_takes_up_a_grossly_wrong_statement(lens: str, stated: Prior) ->
     """A phi of 1500 px was confirmed by a spline, without a word; a height of 2 m by a board and views that moved."""
     calibration = calibrate(sample(), Options(lens=lens, priors=(stated,)))
     (conflict,) = calibration.conflicts
-    assert "the observations alone say" in conflict.words and calibration.warnings == (conflict.words,)
+    assert "the observations alone give" in conflict.words and calibration.warnings == (conflict.words,)
     assert calibration.station().phi == pytest.approx(868.6, abs=1.5) and calibration.options.priors == (stated,)
     assert calibration.digest == sample().digest
 
@@ -202,7 +202,7 @@ def test_nothing_takes_up_what_is_held_wrong_of_a_lens(lens: str, quantity: str,
     (conflict,) = calibration.conflicts
     assert (conflict.kind, conflict.quantity) == ("fixed", quantity) and conflict.stated == pytest.approx(held)
     assert abs(conflict.seen - truth) < 3.0 * conflict.seen_sd < 0.2 * abs(held - truth)
-    assert "the observations alone say" in conflict.words
+    assert "the observations alone give" in conflict.words
     assert not any(word in line for line in calibration.warnings for word in ("whole of", "rolling shutter"))
     assert calibration.options.fixed == {quantity: held} and calibration.options.free_aspect is None
 
@@ -370,7 +370,7 @@ def test_a_height_that_no_calibration_comes_out_of_is_named() -> None:
         words = conflict.words
     except SolutionError as refusal:
         words = str(refusal)
-    assert re.search(r"the stated height of station 'overhead', 150.* say 3.9(69|70) ± 0.053 m.*sigmas apart", words)
+    assert re.search(r"the stated height of station 'overhead', 150.* give 3.9(69|70) ± 0.053 m.*sigmas apart", words)
 
 
 def test_boards_in_another_unit_are_refused() -> None:

@@ -56,7 +56,7 @@ def test_one_file_given_twice_counts_once() -> None:
     twice = calibrate(combine([seen(), seen()]), RADIAL)
     assert_same(twice, calibrated())
     assert twice.remarks == (
-        "936 observations of frame '0001', '0002', 'board_01' and 5 more are there more than once: counted once",
+        "936 observations of frame '0001', '0002', 'board_01' and 5 more are repeated: counted once",
         *calibrated().remarks,
     )
     assert len(twice.rejected) == 936 + len(calibrated().rejected)
@@ -79,7 +79,7 @@ def test_rows_twice_in_one_frame_count_once() -> None:
     points = taken(seen().points, np.sort(np.concatenate([np.arange(len(seen().points)), np.arange(5, 17)])))
     doubled = calibrate(replace(seen(), points=points), RADIAL)
     assert_same(doubled, calibrated())
-    assert doubled.remarks[0] == "12 observations of frame '0001' are there more than once: counted once"
+    assert doubled.remarks[0] == "12 observations of frame '0001' are repeated: counted once"
     assert [entry.row for entry in doubled.rejected] == list(range(6, 30, 2))
 
 

@@ -424,4 +424,4 @@ def test_what_takes_width_back_is_no_reason_for_it(variance: float, probability:
 )
 def test_no_length_is_shorter_than_a_millimetre(length_m: float | None, said: str) -> None:
     repeated = Dependence((Correlation("curves", 0.9, length_m, 0.5, True),))
-    assert repeated.causes == (f"errors are correlated along lines {said} in all views alike",)
+    assert repeated.causes == (f"errors are correlated along lines {said}, the same in all views",)

@@ -109,7 +109,7 @@ def test_what_comes_after_takes_the_field_as_it_was_found(tmp_path: Path) -> Non
 
 def test_nothing_of_size_is_known() -> None:
     observations, _ = solved()
-    with pytest.raises(DegenerateError, match=r"nothing says how large target 'field' is.* measure one of them "):
+    with pytest.raises(DegenerateError, match=r"the size of target 'field' is unknown.* measure one of them "):
         calibrate(observations, Options(lens="radial", dimensions=EVERY))
     for known in (HEIGHT, Prior("target", "field", "field_length_m", (8.28,), (0.005,))):
         calibration = calibrate(observations, Options(lens="radial", dimensions=EVERY, priors=(known,)))
@@ -125,7 +125,7 @@ def test_a_dimension_that_nothing_shows_and_one_that_is_contradicted() -> None:
     without = observations.part(kept, np.ones(len(observations.curves), dtype=bool))
     with pytest.raises(DegenerateError, match="depends on goal_center_to_penalty_mark_m of target 'field'"):
         calibrate(without, Options(lens="radial", dimensions=(*BOTH, "field/goal_center_to_penalty_mark_m")))
-    for name, words in (("line_thickness_m", "no line or point lies elsewhere"), ("depth", "there is no dimension")):
+    for name, words in (("line_thickness_m", "no line or point depends on"), ("depth", "there is no dimension")):
         with pytest.raises(InputError, match=words):
             calibrate(observations, Options(lens="radial", dimensions=(f"field/{name}",)))
     wrong = Prior("target", "field", "field_length_m", (8.6,), (0.005,))

@@ -41,7 +41,7 @@ def test_it_is_joined_from_other_files_and_read_like_them(folder: Path, tmp_path
 
 
 def test_a_folder_that_is_there_is_kept(folder: Path) -> None:
-    with pytest.raises(InputError, match=r"day.columns: is there already: remove it"):
+    with pytest.raises(InputError, match=r"day.columns: exists already: remove it"):
         Observations.load(folder).save(folder)
 
 
@@ -50,7 +50,7 @@ def test_a_folder_that_is_there_is_kept(folder: Path) -> None:
     [
         ("points_view", None, "column points_view is missing"),
         ("curves_pixels", b"nonsense", "curves_pixels.npy: cannot be read"),
-        ("curves_side", "short", "curves_side.npy: cannot be read, it is cut short"),
+        ("curves_side", "short", "curves_side.npy: cannot be read: it is cut short"),
     ],
 )
 def test_what_is_broken_is_named(

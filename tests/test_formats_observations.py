@@ -137,7 +137,7 @@ def test_keypoints_of_colmap_lose_their_half_pixel(tmp_path: Path) -> None:
         ("a.csv", "x_px,y_px,point\n1,z,CenterMark", "line 2: y_px is no finite number, but 'z'"),
         ("a.csv", "x_px,y_px,point\n", "it holds no row"),
         ("a.csv", "point,x_px,y_px\nCenterMark,102,4,800,1", "line 2 has more values than there are columns"),
-        ("a.npz", "hello", "no NPZ file"),
+        ("a.npz", "hello", "not an NPZ file"),
         ("a.csv", "x_px,x_px,y_px\n1,2,3", "a column is there twice"),
         ("a.csv", f"x_px,y_px\n1,{'2' * 200_000}", "not a CSV file"),
         ("a.csv", "x_px,y_px,point\n1,7000,CenterMark\n2,7000,CenterMark", "observations lie outside its image"),

@@ -382,7 +382,7 @@ def test_sigterm_ends_publishing_as_it_ends_other_commands(tmp_path: Path, loopb
     received_geometry(loopback, 20.0)
     time.sleep(0.3)  # it sleeps too, once it has counted the packet
     process.send_signal(signal.SIGTERM)
-    assert f"written were 1 packet to 224.5.23.9:{loopback.port}" in process.communicate(timeout=20)[1]
+    assert f"files written: 1 packet to 224.5.23.9:{loopback.port}" in process.communicate(timeout=20)[1]
     assert process.returncode == 143
 
 

@@ -64,7 +64,7 @@ def test_places_frames_and_what_was_not_seen() -> None:
 @pytest.mark.parametrize("given", [np.ones((4, 2)), [np.ones((480, 640, 3))], 7])
 def test_what_are_no_photographs(given: Any) -> None:
     """Pixels, or images that were read, given to `check` ended in a ValueError of NumPy."""
-    with pytest.raises(InputError, match=r"photographs are named by their files, not given as \w+; of pixels"):
+    with pytest.raises(InputError, match=r"photographs must be file names, not \w+;"):
         image_files(given)
 
 
@@ -91,7 +91,7 @@ def test_one_pixel_and_metres() -> None:
     assert np.array_equal(camera.locate([640, 480], 0.15), camera.locate([[640, 480]], 0.15)[0])
     assert camera.project([0.1, 0.2, 0.0]).shape == (2,)
     with pytest.raises(
-        InputError, match=r"height_m 150 is in metres, and the camera's is 4\.00: for 150 mm give 0\.15"
+        InputError, match=r"height_m is 150 m, but the camera's height is 4\.00 m: for 150 mm give 0\.15"
     ):
         camera.locate([640, 480], 150)
     assert np.isnan(camera.locate([640, 480], 6.0)).all()  # over the camera, but a height

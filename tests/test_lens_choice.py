@@ -323,8 +323,8 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
     with monkeypatch.context() as patched:
         patched.setattr(Candidate, "fault", fold)
         calibration = calibrate(seen)
-    assert calibration.lens_choice is not None and "each of them folds" in calibration.lens_choice.words
-    assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (each of them folds")]
+    assert calibration.lens_choice is not None and "every lens folds" in calibration.lens_choice.words
+    assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (every lens folds")]
     explained, gone = solving.explained, {"kannala-brandt"}
 
     def broken(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
@@ -336,7 +336,7 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
     calibration = calibrate(seen)
     label = label_of(calibration.options)
     assert not label.startswith("kannala-brandt")
-    assert [one for one in calibration.warnings if f"{label}, which was taken, predicts" in one]
+    assert [one for one in calibration.warnings if f"{label} was used, which predicts" in one]
     choice = calibration.lens_choice
     assert choice is not None and choice.chosen == choice.tried[0].label == label
     of_kind = [one for one in choice.tried if one.label.startswith("kannala-brandt")]
@@ -621,7 +621,7 @@ def test_few_observations_keep_to_the_papers_lens() -> None:
     few = observations.part(np.arange(len(observations.points)) < 5, np.ones(0, bool))
     calibration = calibrate(few, Options(free_principal_point=False, fixed={"phi": 868.0, "aspect": 1.0}))
     choice = calibration.lens_choice
-    assert choice is not None and choice.chosen == PAPER and "too few to compare" in choice.words
+    assert choice is not None and choice.chosen == PAPER and "too few observations to compare" in choice.words
     assert any("no lens could be chosen" in words for words in calibration.warnings)
 
 
@@ -732,7 +732,7 @@ def test_that_no_other_lens_could_be_compared_is_said(monkeypatch: pytest.Monkey
     monkeypatch.setattr("ceres_cal.calibration.lens_seen.InlierRows.solved_near", fails)
     monkeypatch.setattr("ceres_cal.calibration.lens_seen._NEAR", -1.0)
     calibration = calibrate(_seen("radial-2-3", "boards"))
-    without = "so the standard deviations do not include what they would say: nothing came out"
+    without = "so the standard deviations do not include the choice of the lens: nothing came out"
     assert f"other lenses could not be compared, {without}" in calibration.warnings
 
 

@@ -139,7 +139,7 @@ def test_boards_that_one_camera_of_a_rig_lists_otherwise_are_named(order: Callab
         each = {"left": left, "right": reordered(right, order, chosen)}
         return combine([Observations.from_points(px, BOARD, SIZE, camera=name) for name, px in each.items()])
 
-    said = f"its points are {words} against those that other cameras see: list them in the same order"
+    said = f"its points are {words} relative to those of other cameras: list them in the same order"
     (warning,) = calibrate(rig(lambda number: number == 3)).warnings
     assert "station 'right', placement 'v3'" in warning and said in warning
     with pytest.raises(SolutionError, match=f"station 'right', placement 'v0' and at 11 others: {said}"):

@@ -54,5 +54,5 @@ def test_a_smaller_error_takes_a_finer_grid() -> None:
 
 def test_what_is_no_table(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="no NPZ file"):
+    with pytest.raises(InputError, match="not an NPZ file"):
         LookupTable.load(tmp_path / "a.npz")

@@ -119,9 +119,9 @@ def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own
     assert noise["c3"] / np.mean([noise[name] for name in ("c0", "c1", "c2")]) == pytest.approx(
         6.0, rel=0.3
     )  # 4.7: the mean counts as ten equations
-    (words,) = (text for text in runs[0].remarks if "not equally noisy" in text)
+    (words,) = (text for text in runs[0].remarks if "noise differs by more" in text)
     assert "'c3'" in words
-    levels = {level for level, text in judge_quality(quality_of(runs[0], noisy(0))).reasons if "equally noisy" in text}
+    levels = {level for level, text in judge_quality(quality_of(runs[0], noisy(0))).reasons if "noise differs" in text}
     assert levels == {""}  # it is in the standard deviations
 
 

@@ -547,7 +547,7 @@ def test_bad_arrays_get_one_line(
 def test_npz_cut_short_anywhere(tmp_path: Path, arrays: dict[str, Any]) -> None:
     whole = saved(tmp_path, arrays).read_bytes()
     for end in range(0, len(whole), 61):
-        assert_refused(written(tmp_path, whole[:end], "obs.npz"), "it is cut short or no NPZ file")
+        assert_refused(written(tmp_path, whole[:end], "obs.npz"), "cut short or not an NPZ file")
 
 
 def message_of(path: Path) -> str | None:
@@ -578,7 +578,7 @@ def test_other_files_under_its_name(tmp_path: Path) -> None:
     stream = io.BytesIO()
     np.save(stream, np.zeros(3))
     for content in (b"", stream.getvalue(), pickle.dumps({"a": 1}), json.dumps(document()).encode()):
-        assert_refused(written(tmp_path, content, "obs.npz"), "it is cut short or no NPZ file")
+        assert_refused(written(tmp_path, content, "obs.npz"), "cut short or not an NPZ file")
     with zipfile.ZipFile(tmp_path / "obs.npz", "w") as archive:
         archive.writestr("notes.txt", "no arrays")
     assert_refused(tmp_path / "obs.npz", "unknown column 'notes.txt'")
@@ -628,7 +628,7 @@ def test_a_name_that_no_file_can_hold(what: str) -> None:
         (
             1.0,
             5.8e6,
-            "target 'target' lies 5800 km from the origin of its numbers, which costs digits: give them from an ",
+            "target 'target' lies 5800 km from its coordinate origin, which loses precision: use an ",
         ),
         (1e3, 0.0, "target 'target' is 18028 m large: are its numbers metres, or millimetres?"),
     ],

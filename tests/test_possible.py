@@ -99,7 +99,7 @@ def test_the_principal_point_tells_swapped_axes() -> None:
     swapped = replace(seen, points=type(seen.points)(**columns | {"pixels": columns["pixels"][:, ::-1]}))
     assert swapped.require_inside() == ()
     text = refusal(swapped)
-    assert "under the floor that it sees: x and y are swapped (its principal point is where that puts it)" in text
+    assert "under the floor that it sees: x and y are swapped (its principal point shows this)" in text
 
 
 def test_boards_in_the_air_are_seen_from_either_side() -> None:
@@ -145,7 +145,7 @@ def test_under_a_floor(depth_m: float) -> None:
 
 
 def test_what_is_seen_lies_behind() -> None:
-    with pytest.raises(SolutionError, match=r"^station 'a': 9 of the 9 observations it has of the world lie behind"):
+    with pytest.raises(SolutionError, match=r"^station 'a': 9 of its 9 observations of fixed targets lie behind"):
         judged(square(0.0), turned_upwards(2.0))
 
 

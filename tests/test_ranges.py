@@ -54,7 +54,10 @@ def test_a_height_in_millimetres_is_asked_about_whatever_its_sigma(sigma: float)
     "stated, words",
     [
         ({"priors": (Prior("station", "overhead", "position_m", (-2270.0, -120.0, 4022.0), (20.0,) * 3),)}, "-2270 m"),
-        ({"priors": (height(-4.02, 0.005),)}, r"is -4.02 m, but it is at least 1e-06 m: the camera sees .* from above"),
+        (
+            {"priors": (height(-4.02, 0.005),)},
+            r"is -4.02 m, but must be at least 1e-06 m: z points upwards, the camera is above",
+        ),
         (
             {"priors": (Prior("station", "overhead", "position_m", (0.0, 0.0, 0.0), (0.1,) * 3),)},
             "position_m .* is 0 m",
@@ -64,9 +67,9 @@ def test_a_height_in_millimetres_is_asked_about_whatever_its_sigma(sigma: float)
         ({"priors": (Prior("camera", "overhead", "cy", (1e6,), (5.0,)),)}, "cy of camera 'overhead' is 1e"),
         (  # which took 24 s, and failed numerically
             {"priors": (Prior("camera", "overhead", "principal_point", (9000.0, 240.0), (5.0, 5.0)),)},
-            "principal_point of camera 'overhead' is 9000 px, but it is at most",
+            "principal_point of camera 'overhead' is 9000 px, but must be at most",
         ),
-        ({"priors": (length(9000.0),)}, r"field_length_m of target 'field' is 9000 m.*drawn with 9 m; is it in mm\?"),
+        ({"priors": (length(9000.0),)}, r"field_length_m of target 'field' is 9000 m.*states 9 m; is it in mm\?"),
         ({"tolerances": {"field": Tolerance(lines_m=10.0)}}, r"tolerance lines_m of target 'field'.*is it in mm\?"),
         ({"tolerances": {"board": Tolerance(warp_m=2.0)}}, r"tolerance warp_m of target 'board'.*is it in mm\?"),
         ({"tolerances": {"field": Tolerance(curve_m={"CenterLine": 5.0})}}, "tolerance CenterLine of target 'field'"),

@@ -72,7 +72,7 @@ def test_swapped_pixels_of_boards_are_no_reason_for_distrust(case: Callable[[str
     quality = quality_of(calibration, observations)
     assert quality.observed_px < 8.0 and judge_quality(quality).level != "no"  # 5.5 measured
     (warning,) = calibration.warnings  # at (479, 638), the middle of a picture of 960 x 1280
-    assert "principal point lies 226 px from the middle" in warning and "is x, not y, the first?" in warning
+    assert "principal point lies 226 px from the middle" in warning and "that x comes before y" in warning
 
 
 @pytest.mark.parametrize("share, off_px", [(0.0, 74.0), (0.0, 8.0), (0.2, 20.0)])
@@ -126,10 +126,10 @@ def calibrated(tmp_path: Path, *arguments: str) -> Calibration:
 @pytest.mark.parametrize(
     "name, words",
     [
-        ("onesigma.json", "point 'TopHalfwayCrossing': its sigma_px is 1e-12 where 0.3 is usual"),
+        ("onesigma.json", "point 'TopHalfwayCrossing': its sigma_px is 1e-12, but 0.3 is usual"),
         ("px1e7.json", "point 'BottomLeftCorner': pixel (96.2, 1e+07) lies"),
         ("one_curve_pixel.json", "curve 'ring_32': pixel (1e+308, 65.6) lies"),
-        ("im1e5.json", "is image_size that of the pictures?"),
+        ("im1e5.json", "check that image_size is the size of the pictures"),
     ],
 )
 def test_an_impossible_number_is_named(

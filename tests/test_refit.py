@@ -218,7 +218,7 @@ def test_a_refit_of_a_refit_changes_nothing(
 
 def test_the_observations_of_a_calibration_are_no_new_ones(observations: Observations) -> None:
     """Without what is usual of cameras they say less: of 549 ± 109 px a phi of 682 ± 399 px was left."""
-    with pytest.raises(InputError, match="the observations that the calibration was made of"):
+    with pytest.raises(InputError, match="the calibration was made from these observations"):
         refit(calibrate(observations, Options(lens="radial")), observations)
 
 
@@ -262,7 +262,7 @@ def test_another_zoom_is_found(calibration: Calibration, zoom: float) -> None:
     camera = replace(CAMERA, phi=zoom * CAMERA.phi)
     result = refit(calibration, seen(FAR, DAY, 2, camera=camera).observations)
     assert result.refitted is not None and result.refitted.what == "zoom"
-    assert result.refitted.explanation.startswith("the zoom was changed, the observations say; station 'overhead' mo")
+    assert result.refitted.explanation.startswith("the data show that the zoom was changed; station 'overhead' mo")
     assert np.max(sigmas_off(result, truth_of(calibration, FAR, camera))) < MOST_SIGMA
 
 
@@ -450,7 +450,7 @@ def test_a_station_that_moved_and_is_said_to_stay(two_cameras: tuple[Calibration
     moved_too = Pose.looking(position, rotation_exp((0.01, 0.0, 0.01)) @ old.rotation)
     there = {**stations, "right": Station("right", moved_too)}
     seen_now = simulate(field_scene(FIELD, calibration.cameras, there, spacing_m=1.0), NOISE, 3).observations
-    with pytest.raises(SolutionError, match=r"station 'right' is said to stay.*moved: name it with --moved, too"):
+    with pytest.raises(SolutionError, match=r"station 'right' was not named with --moved.*moved: name it, too"):
         refit(calibration, seen_now, moved=["left"])
 
 
@@ -510,7 +510,7 @@ def test_how_far_a_camera_moved_is_not_said_where_its_height_is_not_known() -> N
     """Straight down a move of 5 cm came out as 5.3 m."""
     found, _ = of_one_picture("weak", 2)
     assert found.refitted is not None and "mm" not in found.refitted.explanation
-    assert "(how far it moved is not known: its phi is not)" in found.refitted.explanation
+    assert "(the distance is unknown, because phi is)" in found.refitted.explanation
 
 
 def test_other_lenses_count_once() -> None:

@@ -214,7 +214,7 @@ def test_a_focal_length_in_mm_is_refused_by_the_size_of_the_picture(
     monkeypatch.setattr(field, "_looked_for", None)
     ask = [names["PHOTO"], "--target", "ssl-b", "--prior", "phi=4.2:0.1", "-o", str(tmp_path / "made")]
     assert main([command, *ask]) == 2
-    assert "the prior on phi is 4.2 px, but it is at least 40 px" in capsys.readouterr().err
+    assert "the prior on phi is 4.2 px, but must be at least 40 px" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", WRONG)

@@ -115,7 +115,7 @@ def test_a_pipe_among_columns_is_refused(tmp_path: Path, good: Path) -> None:
     column = place / "points_pixels.npy"
     pixels = np.load(column)
     np.save(column, np.asfortranarray(pixels))
-    with pytest.raises(InputError, match=r"points_pixels.npy: its rows do not lie one by one"):
+    with pytest.raises(InputError, match=r"points_pixels.npy: its array is in Fortran order"):
         Observations.load(place)
     column.unlink()
     os.mkfifo(column)
@@ -140,7 +140,7 @@ def test_sizes_are_limited_and_the_limit_can_be_raised(tmp_path: Path, monkeypat
     refused(
         Observations.load,
         path,
-        f"would take 1000000 MB, and a file may take 512 MB: give less at a time, or set {LIMIT}",
+        f"would take 1000000 MB, more than the limit of 512 MB: give less at a time, or set {LIMIT}",
     )
     small = tmp_path / "small.json"
     small.write_bytes(b"[" + b"[]," * 1_000_000 + b"[]]")
@@ -173,7 +173,11 @@ def test_an_archive_that_unpacks_to_gigabytes(tmp_path: Path, good: Path, monkey
     text = b"{'descr': '<i4', 'fortran_order': False, 'shape': (100000000000,), }"
     claims = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + text.ljust(117) + b"\n" + bytes(40)
     columns = {"points_view.npy": claims}
-    refused(Observations.load, repacked(archive, path, columns), "points_view has not as many numbers as it says")
+    refused(
+        Observations.load,
+        repacked(archive, path, columns),
+        "points_view does not hold as many numbers as its header states",
+    )
 
 
 def _png(width: int, height: int) -> bytes:
@@ -248,18 +252,18 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object], folder: Path
     [
         (
             lambda d: next(iter(d["cameras"].values())).update(phi=float("nan")),
-            "nan is no finite number - at `$.cameras",
+            "nan is not a finite number - at `$.cameras",
         ),
         (lambda d: next(iter(d["stations"].values())).update(rotation=[[1, 0, 0]] * 3), "is no rotation matrix"),
         (
             lambda d: next(iter(d["stations"].values())).update(position_m=[0, 0, 9]),
-            "position_m or euler_rad is another",
+            "position_m or euler_rad disagrees",
         ),
         (lambda d: d["options"].update(priors=5), "options.priors: Expected a list"),
         (lambda d: d["options"].update(threads="two"), "Expected a whole number, got a text"),
         (lambda d: d.update(digest="\ud800"), "not valid JSON (cut short?)"),
-        (lambda d: d.update(rounds=10**400), "inf is no finite number"),
-        (lambda d: next(iter(d["cameras"].values())).update(phi=10**400), "inf is no finite number"),
+        (lambda d: d.update(rounds=10**400), "inf is not a finite number"),
+        (lambda d: next(iter(d["cameras"].values())).update(phi=10**400), "inf is not a finite number"),
         (lambda d: d["posterior"].update(keys=d["posterior"]["keys"] * 5000), "'phi' of camera 'overhead' twice"),
         (lambda d: d["posterior"]["keys"][0].__setitem__(1, "x"), "posterior.keys names 'phi' of camera 'x', which is"),
         (lambda d: d["posterior"]["keys"][3].__setitem__(2, "k9"), "names 'k9' of camera 'overhead', which is not"),
@@ -377,7 +381,7 @@ def test_what_the_fuzzer_counts_as_failures(tmp_path: Path, monkeypatch: pytest.
 def test_pixels_far_off_and_another_origin(observations: Observations) -> None:
     pixels = observations.curves.pixels.copy()
     pixels[:9] = (99999.0, -5.0)
-    with pytest.raises(InputError, match="lies 10 images away"):
+    with pytest.raises(InputError, match="lies 10 image diagonals away"):
         calibrate(replace(observations, curves=replace(observations.curves, pixels=pixels)), RADIAL)
     moved = replace(observations.curves, pixels=observations.curves.pixels + 300.0)
     size = next(iter(observations.cameras.values()))

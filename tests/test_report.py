@@ -227,7 +227,7 @@ def test_a_wrong_model_is_never_simply_trusted() -> None:
         assert 0.5 * stated_mm < np.quantile(off_mm, 0.95) < stated_mm  # 5.9 and 6.0
     assert "The accuracy in the first line includes this" in page
     cards = re.findall(r'<article class="card (\w+)"><h3>(.*?)</h3>', page)
-    assert cards[0][0] == "no" and "residuals follow the radius" in cards[0][1]
+    assert cards[0][0] == "no" and "residuals vary with the radius" in cards[0][1]
 
 
 def test_no_accuracy_is_stated_where_the_noise_is_three_times_the_stated_one() -> None:
@@ -355,7 +355,7 @@ def test_new_data_tell_a_camera_that_was_bumped(turned_deg: float, found: str) -
     observations = simulate(bumped, disturbance, seed=7).observations
     page = make_report(calibration, observations, diagnose(calibration, observations, new_data=True))
     assert headline(page).startswith(found)
-    assert ("would move it by" in page) == (turned_deg > 0.0)
+    assert ("would move them by" in page) == (turned_deg > 0.0)
 
 
 # ---- what is drawn --------------------------------------------------------------------------------------------------

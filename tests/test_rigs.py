@@ -122,7 +122,7 @@ def test_frames_of_one_moment(left: list[str], right: list[str], rule: str, mome
         (["left1", "left2", "left3"], "up*,right*", "no pattern fits frame 'left1' of camera 'left'"),
         (["left1", "left2", "left3"], "left*,*", "several patterns fit"),
         (["left1", "left2", "left3"], "left,right", r"one \* in each"),
-        (["left7", "left8", "left9"], "left*,right*", "no two cameras have one in common"),
+        (["left7", "left8", "left9"], "left*,right*", "no two cameras have a frame in common"),
         (["left1", "left2", "left3"], "within:0.4", "'left1' is no number"),
     ],
 )
@@ -133,7 +133,7 @@ def test_frames_are_never_guessed(left: list[str], rule: str, why: str) -> None:
 
 def test_moments_must_be_apart() -> None:
     seen = _named({"left": ["1.0", "1.5", "2.0"], "right": ["1.1", "1.6", "2.1"]})
-    with pytest.raises(InputError, match=r"below half of the 0\.5 between frames of camera 'left'"):
+    with pytest.raises(InputError, match=r"below half of 0\.5, the interval of frames of camera 'left'"):
         with_same_frames(seen, "within:0.4")
 
 
@@ -172,8 +172,8 @@ def test_cameras_without_a_common_moment_have_no_baseline() -> None:
 
     calibration = calibrate(replace(rig, views=tuple(map(apart, rig.views))))
     assert calibration.uncertainty.rig == () and len(calibrate(rig).uncertainty.rig) == 1
-    (said,) = (text for text in calibration.remarks if "nothing ties" in text)
-    assert "join --same-frame" in said and not any("nothing ties" in text for text in calibrate(rig).remarks)
+    (said,) = (text for text in calibration.remarks if "nothing connects" in text)
+    assert "join --same-frame" in said and not any("nothing connects" in text for text in calibrate(rig).remarks)
 
 
 def test_few_boards_before_a_pair_are_as_wide_as_they_are_off() -> None:
@@ -254,11 +254,11 @@ def test_turned_labels_are_no_exchanged_frames() -> None:
 
 
 def test_a_camera_one_frame_late_is_named() -> None:
-    """It missed half of its observations: "check labels, target dimensions and which lens it is"."""
+    """It missed half of its observations: "check labels, target dimensions and the lens"."""
     seen = _rig(checkerboard(9, 6, 0.1), 8)
     names = list(dict.fromkeys(view.frame for view in seen.views))
     late = _in_other_frames(seen, dict(zip(names, names[1:] + names[:1], strict=True)))
-    with pytest.raises(SolutionError, match=r"'left' and 'right' do not show the same moments.* shows 1 frame later"):
+    with pytest.raises(SolutionError, match=r"frames of 'left' and 'right' are shifted.* shows 1 frame later"):
         calibrate(late, _BROWN)
 
 
@@ -276,7 +276,7 @@ def test_a_board_that_moves_between_two_shutters_is_named() -> None:
         simulate(one, Disturbance(points_sigma_px=0.1), seed=3).observations.of_station(station)
         for one, station in ((scene, "left"), (replace(scene, placements=moved), "right"))
     ]
-    with pytest.raises(SolutionError, match="at most moments 'left' and 'right' see a board at different places"):
+    with pytest.raises(SolutionError, match="in most frames 'left' and 'right' see the board at different places"):
         calibrate(combine(sides), _BROWN)
 
 

@@ -213,7 +213,7 @@ def test_a_folder_without_images_names_those_of_its_cameras(tmp_path: Path, caps
     (tmp_path / "left").mkdir()
     shutil.copy(PHOTOGRAPH, tmp_path / "left")
     assert main(["detect", "field", str(tmp_path), "--target", "ssl-b", "--auto", "-o", str(tmp_path / "x.json")]) == 2
-    assert "there are no images in this folder, but in its left" in capsys.readouterr().err
+    assert "this folder contains no images; there are some in left" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["bad.png", "bad.avi"])

@@ -48,7 +48,7 @@ def test_what_is_written_obeys_and_what_does_not_is_refused(tmp_path: Path) -> N
     for change, words in (
         ({"units": "millimetres, radians, pixels"}, r"millimetres.*in units"),
         ({"pixel_origin": "corner of the top-left pixel"}, "in pixel_origin"),
-        ({"cameras": {"overhead": {**data["cameras"]["overhead"], "phi": 800.0}}}, "camera_matrix is another than"),
+        ({"cameras": {"overhead": {**data["cameras"]["overhead"], "phi": 800.0}}}, "camera_matrix disagrees with"),
     ):
         path.write_text(json.dumps({**data, **change}))
         with pytest.raises(InputError, match=words):

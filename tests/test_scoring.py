@@ -45,7 +45,7 @@ def calibration() -> Calibration:
 def test_new_boards_are_predicted_to_the_noise(calibration: Calibration) -> None:
     answers = score(calibration, _boards(12, 2))
     (answer,) = answers.values()
-    assert answers.holds and "is good for these: it predicts them to 0.2" in answer.words
+    assert answers.holds and "is good for these observations: it predicts them to 0.2" in answer.words
     assert answer.misfit.noise[0] == pytest.approx(1.0, abs=0.06)  # 1.00
     assert answer.name == "camera" and answer.misfit.points == 12 * 54
     assert len(answer.views) == 12 and answer.views[0].misfit.all_rms_px >= answer.views[-1].misfit.all_rms_px
@@ -57,7 +57,7 @@ def test_a_board_that_the_lens_cannot_show_is_named(calibration: Calibration) ->
     seen = _boards(2, 3)
     shuffled = np.random.default_rng(0).permutation(seen.points.pixels[:54])
     pixels = np.vstack([shuffled, seen.points.pixels[54:]])
-    with pytest.raises(DegenerateError, match=r"board_01.*54 points.*none shows its points through this lens"):
+    with pytest.raises(DegenerateError, match=r"board_01.*54 points.*no pose explains its points with this lens"):
         score(calibration, replace(seen, points=replace(seen.points, pixels=pixels)))
 
 
@@ -173,7 +173,7 @@ def test_score_and_compare_as_typed(say: Say, calibration: Calibration, tmp_path
     calibration.save(known)
     _boards(3, 8).save(new)
     said = say("score", known, new)
-    assert said.code == 0 and said.out.startswith("score     camera is good for these: it predicts")
+    assert said.code == 0 and said.out.startswith("score     camera is good for these observations: it predicts")
     data = json.loads(say("score", known, new, "--loss", "trivial", "--reject-sigma", "inf", "--json").out)
     assert data["cameras"][0]["points"] == 162 and len(data["views"]) == 3
     said = say("compare", known, known)

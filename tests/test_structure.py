@@ -168,8 +168,8 @@ def test_what_each_number_moves() -> None:
     "tolerances, message",
     [
         ({"pitch": Tolerance(lines_m=0.01)}, "a tolerance: there is no target 'pitch'"),
-        ({"field": Tolerance(warp_m=0.01)}, "a warp, heights or a stretch are for checkerboards"),
-        ({"field": Tolerance(heights_m=0.01)}, "does not bow"),
+        ({"field": Tolerance(warp_m=0.01)}, "warp_m, heights_m and stretch_m are for checkerboards"),
+        ({"field": Tolerance(heights_m=0.01)}, "is of kind"),
     ],
 )
 def test_tolerances_that_do_not_fit(tolerances: dict[str, Tolerance], message: str) -> None:

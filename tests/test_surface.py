@@ -121,7 +121,7 @@ def test_it_is_asked_for_by_its_name() -> None:
     plain, longer = make_lens("spline"), make_lens("spline", terms=("surface",))
     assert set(longer.names) - set(plain.names) == {"wide", "high", *NODES} and not plain.nodes
     assert set(longer.listed) == {*plain.names, "wide", "high"}
-    assert "192 nodes displaces by 0.2 px" in CAMERA.lens.note and "nodes" not in plain.note
+    assert "192 nodes adds 0.2 px" in CAMERA.lens.note and "nodes" not in plain.note
     assert make_lens("spline", coefficients={"x0304": 1.0}).names == longer.names
     spanned = longer.spanning(0.6, 800.0, 1.1, (1280, 960)).coefficients
     assert spanned["wide"] == pytest.approx(0.92) and spanned["high"] == pytest.approx(0.69)

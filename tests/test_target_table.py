@@ -138,7 +138,7 @@ def test_what_is_asked_of_a_target_is_its_own() -> None:
     assert len(turns_of(court(6.0), court(6.0).curve_names)) == 4
     smaller = mistaken_targets(observations)["the other court"]
     assert smaller.targets["field"] == court(4.0)
-    with pytest.raises(InputError, match="does not bow"):
+    with pytest.raises(InputError, match="is of kind"):
         calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(warp_m=0.001)}))
     with pytest.raises(InputError, match=r"here.size_m: Expected a number, got a text"):
         target_from_spec({"kind": "court", "size_m": "6"}, "here")

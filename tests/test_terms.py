@@ -45,7 +45,7 @@ def test_terms_are_named_by_the_lens() -> None:
         make_lens("kannala-brandt", terms=("prism",))
     with pytest.raises(InputError, match="lens 'radial' has no terms 'rational': there are tangential"):
         Options(lens="radial", terms=("rational",))
-    with pytest.raises(InputError, match="terms are of a lens that is named"):
+    with pytest.raises(InputError, match="terms need a named lens"):
         Options(lens="auto", terms=("rational",))
 
 

@@ -505,7 +505,7 @@ def test_what_no_map_can_be_made_of() -> None:
     with pytest.raises(InputError, match="has no free number 'aspect'"):
         known.verdict("camera", "overhead", "aspect")
     boards = calibrate(make_trial(CASES["boards"].make(), CLEAN_NOISE, 0).observations, RADIAL).uncertainty
-    with pytest.raises(InputError, match="station 'camera' was held as the world"):
+    with pytest.raises(InputError, match="station 'camera' defines the world"):
         boards.map_sd_mm(x_m=[0.0], y_m=[0.0])
     with pytest.raises(InputError, match="no field to draw a map of: give x_m and y_m"):
         boards.map_sd_mm()
@@ -648,4 +648,4 @@ def test_phi_is_known_no_better_without_what_is_usual() -> None:
     calibration = calibrate(Observations.from_points(shown, board, (640, 480)))
     phi = calibration.station().phi
     assert calibration.uncertainty.posterior.sd_of("camera", "camera", "phi") > 0.3 * phi  # 0.54 measured
-    assert [words for words in calibration.remarks if words.endswith("deviation of phi is larger than itself")]
+    assert [words for words in calibration.remarks if words.endswith("deviation of phi is larger than phi itself")]

@@ -55,7 +55,7 @@ def _read(content: bytes, columns: Mapping[str, Column] | None, where: str) -> d
     except InputError:
         raise
     except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen types of errors for a broken archive
-        raise InputError(f"{where}: cannot be read, it is cut short or no NPZ file ({error}): write it again") from None
+        raise InputError(f"{where}: cannot be read: cut short or not an NPZ file ({error}): write it again") from None
 
 
 def _names(archive: zipfile.ZipFile, columns: Mapping[str, Column] | None, where: str) -> list[str]:
@@ -84,7 +84,7 @@ def _column(archive: zipfile.ZipFile, name: str, column: Column | None, where: s
         size = math.prod(shape) * dtype.itemsize
         data = stream.read() if size == entry.file_size - stream.tell() else b""
     if size != len(data):
-        raise ValueError(f"{name} has not as many numbers as it says")
+        raise ValueError(f"{name} does not hold as many numbers as its header states")
     return np.frombuffer(data, dtype).reshape(shape, order="F" if in_columns else "C")
 
 

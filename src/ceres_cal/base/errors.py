@@ -130,4 +130,4 @@ def note(path: object) -> None:
 def noted_words() -> str:
     """List the files that have been written, as the end of a message."""
     files = _noted.get()
-    return f"written were {first_of(files)}" if files else "nothing was written"
+    return f"files written: {first_of(files)}" if files else "nothing was written"

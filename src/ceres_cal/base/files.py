@@ -88,8 +88,8 @@ def require_room(needed: float, where: str) -> None:
     """Raise InputError, before any memory is allocated, where content would take more than `most_bytes`."""
     if needed > most_bytes():
         raise InputError(
-            f"{where}: would take {needed / 1e6:.0f} MB, and a file may take {most_bytes() / 1e6:.0f} MB: "
-            f"give less at a time, or set {LIMIT}={math.ceil(needed / 1e6)} if that is meant"
+            f"{where}: would take {needed / 1e6:.0f} MB, more than the limit of {most_bytes() / 1e6:.0f} MB: "
+            f"give less at a time, or set {LIMIT}={math.ceil(needed / 1e6)} to allow it"
         )
 
 
@@ -238,7 +238,7 @@ def _require_unique_keys(content: bytes, where: str) -> None:
 def _require_finite(value: Any, place: str, where: str) -> None:
     if isinstance(value, float):
         if not math.isfinite(value):
-            raise InputError(f"{where}: {value} is no finite number - at `{place}`")
+            raise InputError(f"{where}: {value} is not a finite number - at `{place}`")
     elif isinstance(value, dict):
         for name, entry in value.items():
             _require_finite(entry, f"{place}.{name}", where)

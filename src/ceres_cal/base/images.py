@@ -25,8 +25,7 @@ def image_files(given: Images) -> list[Path]:
     for one in each:
         if not isinstance(one, str | PathLike):
             raise InputError(
-                f"photographs are named by their files, not given as {type(one).__name__}; of pixels "
-                "`Observations.from_points` makes observations"
+                f"photographs must be file names, not {type(one).__name__}; `Observations.from_points` takes pixels"
             )
     if not each:
         raise InputError("no photograph is given: name files, folders, or videos")
@@ -40,7 +39,7 @@ def _files(name: str) -> Iterable[Path]:
         if not inside:
             folders = ", ".join(folder.name for folder in each_camera([name]))
             raise InputError(
-                f"{name}: there are no images in this folder{f', but in its {folders}' if folders else ''}"
+                f"{name}: this folder contains no images{f'; there are some in {folders}' if folders else ''}"
             )
         return inside
     if path.exists():

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 
 _OTHERWISE = (
-    "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
-    "priors and their units"
+    "no calibration agrees with the stated priors, but the observations alone determine one: check the priors and "
+    "their units"
 )
 
 
@@ -104,9 +104,9 @@ def _others_can(failure: CalibrationError, observations: Observations, options: 
             return ""
         left_out.append(found.camera)
         observations = observations.without_camera(found.camera)
-        found = attempt(partial(_measured, observations, options, None, None))  # reads: "... the other 3 cameras can"
+        found = attempt(partial(_measured, observations, options, None, None))  # reads: "... 3 other cameras can"
     those, others = ", ".join(map(repr, left_out)), counted(len(observations.cameras), "other camera")
-    return f"; {others} can be calibrated without what {those} observed: leave that out"
+    return f"; {others} can be calibrated if the observations of {those} are left out"
 
 
 def lenses_by_held_out(observations: Observations, options: Options) -> Mapping[str, LensChoice]:
@@ -293,7 +293,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
         # reads: "another lens explains observations that were taken out, ..."
         found = attempt(partial(seen_with, other))
         if isinstance(found, CalibrationError):
-            without = "but makes no calibration of all"
+            without = "but the calibration with it fails"
             said.append(f"another lens explains observations that were taken out, {without}: {found}")
             break
         seen, chosen = found, other
@@ -308,7 +308,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
         if others.failed:
-            without = "the standard deviations do not include what they would say"
+            without = "the standard deviations do not include the choice of the lens"
             said.append(f"other lenses could not be compared, so {without}: {others.failed}")
     choices = {name: one.choice for name, one in chosen.each.items()}
     return replace(calibration, lens_choices=choices, warnings=(*calibration.warnings, *chosen.caveats, *said))
@@ -351,7 +351,7 @@ def _from_there(free: Calibration, observations: Observations, options: Options)
     if words:
         raise SolutionError(words) from None
     start = Start(free.estimate, free.phi_from)
-    # reads: "no calibration agrees with what was stated beforehand, though ..."
+    # reads: "no calibration agrees with the stated priors, but ..."
     found = attempt(partial(_of_lens_asked, Task(), start, gather_sights(observations), options))
     if isinstance(found, CalibrationError):
         raise SolutionError(_OTHERWISE) from None

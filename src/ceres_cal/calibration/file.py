@@ -39,14 +39,14 @@ class Rejection(Frozen, eq=True):
         return self.reason.startswith("the whole of ")
 
 
-TOO_FEW = "the observations are too few to compare lenses by"
+TOO_FEW = "there are too few observations to compare lenses"
 _NOT_THE_BEST = (
-    "the lens that predicts best makes no calibration of all observations; {}, which was taken, predicts {:.1f} "
-    "standard errors worse, and its map may be off by more than is stated: name another lens (--lens)"
+    "the lens that predicts best cannot be calibrated with all observations, so {} was used, which predicts {:.1f} "
+    "standard errors worse. Its map may be off by more than is stated: name another lens (--lens)"
 )
 _NOT_CHOSEN = (
-    "no lens could be chosen ({}), and {} was taken: what is stated counts no lens with more coefficients: name the "
-    "camera's (--lens)"
+    "no lens could be chosen ({}), so {} was used. The stated uncertainties do not consider lenses with more "
+    "coefficients: name the camera's lens (--lens)"
 )
 
 
@@ -86,14 +86,14 @@ class LensChoice(Frozen, eq=True):
     def words(self) -> str:
         """One line for people."""
         if not self.groups:
-            return f"{self.chosen}, not compared by what it predicts: {self.tried[0].failed or TOO_FEW}"
+            return f"{self.chosen}, not compared with other lenses: {self.tried[0].failed or TOO_FEW}"
         others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
         if not others or self.tried[0].rms_px is None:
             return f"{self.chosen}, the only one that can be calibrated"
         over = ", ".join(f"{one.label} {one.rms_px:.4f} px ({one.worse:+.1f})" for one in others[:3])
         return (
-            f"{self.chosen} of {len(self.tried)}: predicts {self.groups} held-out parts to {self.tried[0].rms_px:.4f} "
-            f"px; next {over} (standard errors by which they predict worse)"
+            f"{self.chosen} of {len(self.tried)} lenses: predicts {self.groups} held-out parts to "
+            f"{self.tried[0].rms_px:.4f} px; next {over} (in parentheses: standard errors worse)"
         )
 
     @property
@@ -217,7 +217,7 @@ class StationFile(PoseFile, forbid_unknown_fields=True):
         again, reach_m = StationFile.of_station(station), 1.0 + float(np.linalg.norm(self.translation_m))
         turned = np.max(np.abs(rotation_from_euler(*self.euler_rad) - station.cam_from_world.rotation))
         if not np.allclose(again.position_m, self.position_m, rtol=0.0, atol=alike * reach_m) or turned > alike:
-            raise InputError("position_m or euler_rad is another one than that of rotation and translation_m")
+            raise InputError("position_m or euler_rad disagrees with rotation and translation_m: correct one")
         return station
 
 

@@ -52,7 +52,7 @@ from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Construction
 from ceres_cal.start.initialise import Start
 
-_BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
+_BROKEN = "the solve leaves larger residuals than its linear model predicted"
 _EXPLAINED = "takes out observations that another lens explains"
 
 

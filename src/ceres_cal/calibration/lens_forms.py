@@ -188,7 +188,7 @@ def decide(
     """
     known = {i: one for i, one in enumerate(squares) if one is not None}
     if not known:
-        raise DegenerateError("each of them folds or cannot be solved for: check labels and dimensions")
+        raise DegenerateError("every lens folds inside the image or cannot be solved for: check labels and dimensions")
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
     least = {sizes[i]: min(totals[j] for j in totals if sizes[j] == sizes[i]) for i in totals}

@@ -259,7 +259,7 @@ def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, Le
     cameras = dict(estimate.cameras)
     for name, profile in profiles.items():
         if not len(profile.angles):
-            raise DegenerateError(f"camera {name!r}: its lens shows nothing that was observed: check pixels and labels")
+            raise DegenerateError(f"camera {name!r}: its lens projects no observation: check pixels and labels")
         phi, edge = cameras[name].phi, edge_over(cameras[name], profile.reach_px)
         blank = options.blank_lens.spanning(float(profile.angles[-1]), phi, edge, cameras[name].image_size)
         lens = profile.nearest(blank, phi, options.held)
@@ -377,7 +377,7 @@ class InlierRows(Frozen):
             problem = problem.holding(held.owner, intrinsic_names(start.cameras[held.owner].lens).index(held.quantity))
         solution = found(solve(problem, start, precision=_AT_BEST, posed=_AT_BEST))
         if as_promised and 2.0 * solution.cost > self._kept(candidate):
-            raise DegenerateError("is not at its best where normal equations have it")
+            raise DegenerateError("the solve leaves larger residuals than its linear model predicted")
         return solution
 
     def _kept(self, candidate: Candidate) -> float:

@@ -44,18 +44,18 @@ _LOST = 1e3
 # on it.
 _RESTING = 1.5
 _USUAL = (
-    "camera {!r}: phi and the numbers correlated with it are determined only with what is usual of cameras (a usual "
-    "phi, a principal point near the middle of the image, square pixels, little decentring). Without that the standard "
-    "deviation of phi is {}"
+    "camera {!r}: phi and the numbers correlated with it are determined only by assuming a usual camera (a usual phi, "
+    "a principal point near the middle of the image, square pixels, little decentring). Without this assumption the "
+    "standard deviation of phi is {}"
 )
 _OBLONG = (
-    "camera {!r}: fy / fx comes out as {:.4f}. Few cameras have pixels so far from square. If its pixels are "
+    "camera {!r}: fy / fx is estimated as {:.4f}. Few cameras have pixels so far from square. If its pixels are "
     "square, the length or the width of the target is wrong by {} %: measure it, or state --fix aspect=1"
 )
 _SQUARED = (
-    "camera {!r}: its pixels are taken for square, but the observations alone say fy / fx = {:.3f} ± {:.3f}. If its "
-    "pictures were stretched, its height and places above the floor are wrong: state --fix aspect=1 if they were not, "
-    "--free-aspect if they were"
+    "camera {!r}: its pixels are assumed to be square, but the observations alone give fy / fx = {:.3f} ± {:.3f}. If "
+    "its pictures were stretched, its height and places above the floor are wrong: state --fix aspect=1 if they were "
+    "not, --free-aspect if they were"
 )
 _BEHIND = (
     "camera {!r} sees all {} checkerboards from behind: its pictures are mirrored, x and y of its pixels or rows and "
@@ -212,8 +212,8 @@ def _worlds_apart(observations: Observations) -> Iterator[str]:
     if len(alone) + any(view.placement is None for view in observations.shown_views) > 1:
         names = ", ".join(map(repr, alone))
         yield (
-            f"nothing ties {names} to the other stations, and no pose says how they stand to each other; where they "
-            "saw boards at the same moments, give frames of one moment one name (ceres-cal join --same-frame)"
+            f"nothing connects {names} to the other stations, so their relative poses are unknown. If they saw a board "
+            "at the same moment, give these frames the same name (ceres-cal join --same-frame)"
         )
 
 
@@ -222,13 +222,13 @@ def _noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
     if noise:
         each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())
         yield (
-            f"beside what was stated of them observations are not equally noisy ({each} times the mean): each "
-            "counts by its own noise; look whether the noisiest photographs are sharp, or state sigma_px of clicks"
+            f"the noise differs by more than the stated sigmas ({each} times the mean): each is weighted by its own "
+            "noise. Check that the noisiest photographs are sharp, or state sigma_px of manual clicks"
         )
 
 
 def _share_text(share: float) -> str:
-    return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"
+    return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than phi itself"
 
 
 def came_out(

@@ -186,7 +186,7 @@ def _wrong_label(tested: TestResults, target: str, labels: list[WrongLabel]) -> 
     )
     return Finding(
         "wrong label", "observations", f"{target}/{names[one.feature]}", frames[0], sentence,
-        "correct the label; it was taken out and did no harm", px, mm, px / away, (),
+        "correct the label; it was taken out and does not affect the result", px, mm, px / away, (),
         tested.selection.log10_p(min(label.log_p for label in labels)), len(rows),
         tuple((kind, int(row)) for row in rows),
     )  # fmt: skip
@@ -225,18 +225,18 @@ def larger(noise: Noise) -> tuple[float, float, Words]:
         f"{noise.sigma_px / noise.scale:.3f}"
     )
     amount = Amount("scale", noise.scale, noise.scale / float(np.sqrt(2.0 * noise.observations)), "")
-    advice = "state the larger sigma where sigmas are taken as stated; the estimated scale is right already"
+    advice = "state the larger sigma if sigmas are used as stated; an estimated noise scale includes this already"
     return noise.log_p, noise.sigma_px, Words(sentence, advice, (amount,))
 
 
 def correlated(noise: Noise) -> tuple[float, float, Words]:
     """Return log P, size in px and words of the correlation of neighbouring residuals."""
     sentence = (
-        f"neighbouring residuals of {noise.kind} agree (correlation {noise.correlation:.2f}): "
-        f"{noise.observations} observations say as much as {noise.effective:.0f} independent ones"
+        f"neighbouring residuals of {noise.kind} are correlated (coefficient {noise.correlation:.2f}): "
+        f"{noise.observations} observations count as much as {noise.effective:.0f} independent ones"
     )
     amount = Amount("correlation", noise.correlation, 1.0 / float(np.sqrt(noise.observations)), "")
-    advice = "look for what shifts whole features; the standard deviations have it in them"
+    advice = "look for what displaces whole features; the standard deviations include this already"
     shared_px = noise.sigma_px * float(np.sqrt(max(noise.correlation, 0.0)))
     return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))
 
@@ -262,11 +262,11 @@ def does_not_hold(tested: TestResults) -> Iterator[Finding]:
         return
     px, mm, count = case.effect(np.where(used, (model.shared @ step) / model.weight, 0.0), used)
     sentence = (
-        f"the calibration does not hold on these observations: a refit would move it by {px:.2f} px, {mm:.1f} mm rms"
+        f"the calibration does not fit these observations: a refit would move them by {px:.2f} px, {mm:.1f} mm rms"
     )
     yield Finding(
         "does not hold", "calibration", ", ".join(case.problem.observations.stations), None, sentence,
-        "find out with `ceres-cal check` whether the camera was moved, and refit", px, mm,
+        "run `ceres-cal check` to see whether the camera was moved, then refit", px, mm,
         px / case.noise_px(left, used), (), tested.selection.log10_p(log_p), count,
     )  # fmt: skip
 
@@ -286,7 +286,7 @@ def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:
     case, structure = tested.case, tested.case.estimate.structure
     targets = case.problem.observations.targets
     numbers = numbers_by_kind(structure, targets)[one.target, one.kind]
-    advice = "none is needed; a flat, exact target needs fewer views"
+    advice = "nothing to do; with a flat and exact target fewer views are needed"
     if is_another(one, targets[one.target]):
         advice = "check the order of its points, and its kind, columns, rows and dimensions"
     offsets = np.zeros(len(structure.offsets) + 1)

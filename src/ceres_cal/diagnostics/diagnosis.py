@@ -88,7 +88,7 @@ class Diagnosis(Frozen):
         return any(finding.is_model_error for finding in self.findings)
 
 
-_FIRST = "correct first what was stated beforehand and is contradicted: this may come from it"
+_FIRST = "first correct the stated value that the observations contradict: it may cause this finding"
 
 
 @checked

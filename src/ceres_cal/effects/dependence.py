@@ -241,7 +241,7 @@ class Dependence(Frozen, eq=True):
             causes.append(f"views move by {two_digits(self.read_out_px)} px while rows are read out (rolling shutter)")
         if self.between is not None and self.between.probability > LIKELY and self.between.variance > 1.0:
             factor = two_digits(self.between.variance**0.5)
-            causes.append(f"views scatter {factor} times as far as what is within them says")
+            causes.append(f"views scatter {factor} times as much as the errors within them predict")
         return tuple(causes)
 
 
@@ -252,7 +252,7 @@ def _reach(correlation: Correlation) -> str:
     else:  # an error that repeats at each place alone has no length: the likeliest one was 13 nm
         over = f" over {two_digits(length)} m" if length >= 1e-3 else " over less than 1 mm"
     over += "" if correlation.camera is None else f" in camera {correlation.camera!r}"
-    return over + (" in all views alike" if correlation.lasting else "")
+    return over + (", the same in all views" if correlation.lasting else "")
 
 
 class Scatter(Frozen):

@@ -68,7 +68,7 @@ class AsBuilt(Frozen, eq=True):
         amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
         if self.kind == "heights":
             return f"its surface is uneven by {amount}"
-        return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
+        return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} are displaced by {amount}"
 
 
 class EffectEstimate(Frozen, eq=True):
@@ -238,7 +238,7 @@ class Evidence(Frozen):
         """The effect in words."""
         px, mm, _ = self.effect
         digits = 1 if mm >= 0.1 else 2
-        return f"{px:.2f} px, {mm:.{digits}f} mm rms, {two_digits(self.noise_ratio)} of the noise"
+        return f"{px:.2f} px, {mm:.{digits}f} mm rms, {two_digits(self.noise_ratio)} times the noise"
 
     def most_px(self, rows: Mask | bool = True) -> float:
         """The largest displacement (px) among the chosen equations that take part."""
@@ -344,7 +344,7 @@ class Effect(Frozen):
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
             sentence += f"; these data do not distinguish it from {names}"
         if self.is_implausible(case, score):
-            sentence += ". That is more than usual, so it is probably something else that looks like it"
+            sentence += ". This is larger than usual, so a similar effect is the more probable cause"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, px, mm, evidence.noise_ratio, mending,
             selection.log10_p(score.log_p), observations,

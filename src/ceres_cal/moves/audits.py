@@ -208,8 +208,8 @@ def _cause(case: _AuditCase, camera: Camera, best: float, degrees: int, posed: b
     within = (0, *((1,) if camera.aspect != 1.0 else ()), 2, 3, *(4 + number for number in used))
     refitted = case.least(here, pose=True, lens=within)[0]
     if not _sound(refitted - best, max(degrees - 6 - len(within), 1)):
-        return "too few coefficients", "its lens model with the coefficients that it uses cannot explain them: " + (
-            f"a {case.ours.station().lens.kind} lens does ({', '.join(case.ours.station().lens.names)})"
+        return "too few coefficients", "its lens model cannot explain them with the coefficients that it uses: " + (
+            f"a {case.ours.station().lens.kind} lens can ({', '.join(case.ours.station().lens.names)})"
         )
     return "other intrinsics", "another zoom or lens, or it was calibrated from too little: calibrate again"
 
@@ -254,7 +254,7 @@ def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]
     for scale in scales:
         yield (
             "another image size",
-            f"it is one of images {short(scale, 3)} times as large",
+            f"it was made for images {short(scale, 3)} times as large",
             resized(camera, scale, (wide, high)),
         )
 
@@ -274,9 +274,9 @@ def _words(cause: str | None, what_to_do: str, change: MapChange, posed: bool) -
         f"{short(one.rms_mm)} mm rms and {short(one.most_mm)} mm at most {at_height(one.height_m)}"
         for one in change.maps
     ]
-    placed = "" if posed else " (from the pose that is best for it: it says none)"
+    placed = "" if posed else " (from its best-fitting pose: its file has none)"
     if cause is None:
-        off = f", within {', '.join(sizes)} of ours" if sizes else ""
-        return f"explains the observations as well as a calibration of its own would{placed}{off}"
-    off = f"; it is off by {', '.join(sizes)}" if sizes else ""
+        off = f"; its map differs from the new one by {', '.join(sizes)}" if sizes else ""
+        return f"explains the observations as well as a new calibration would{placed}{off}"
+    off = f"; its map is off by {', '.join(sizes)}" if sizes else ""
     return f"does not explain the observations{placed}: {cause}: {what_to_do}{off}"

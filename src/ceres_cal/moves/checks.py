@@ -98,13 +98,13 @@ def check(
     world = sights.of_world
     for name in observed.stations:
         if name not in world:
-            raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
+            raise InputError(f"station {name!r} sees no fixed target: observe the field with it")
     level = false_alarms / (len(world) * checks)
     stations = {name: _checked(calibration, sight, level) for name, sight in world.items()}
     for name in (name for name, answer in stations.items() if answer.holds is False):
         for words in calibration.ambiguities:
             if words.startswith(f"station {name!r}: "):
-                raise InputError(f"{words}, and calibrate again: until then nobody can say that it moved")
+                raise InputError(f"{words}, and calibrate again: until then a move cannot be detected")
     return Agreements(stations, false_alarms, checks)
 
 
@@ -187,7 +187,7 @@ def _case(calibration: Calibration, sight: Sights) -> _CheckCase:
     key, old, posterior = sight.key, calibration.estimate, calibration.uncertainty.posterior
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
-        raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
+        raise InputError(f"station {key.station!r} defines the world: a move of it cannot be detected")
     structure = calibration.options.structure_of(sight.observations.targets).carrying(old.structure)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     kept = [k for k in posterior.keys if k in own or k.is_structure]
@@ -314,8 +314,8 @@ def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
 def _not_understood(case: _CheckCase, misfit: Misfit) -> Agreement:
     inside = misfit.points + misfit.curves
     words = (
-        f"moved far, or not understood: only {inside} of {inside + misfit.outliers} observations fit the known lens "
-        "from anywhere near: refit, or check labels and camera"
+        f"moved far, or cannot be explained: only {inside} of {inside + misfit.outliers} observations fit the known "
+        "lens at any pose nearby: refit, or check labels and camera"
     )
     return not_found(case.name, words, misfit)
 
@@ -331,7 +331,7 @@ def _words(answer: Agreement) -> str:
     worst_mm = change.maps[0].worst_mm if change and change.maps else np.nan  # for a station that sees no field
     if answer.holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
-        words = f"holds: no change beyond what is known ({at_most}probability {answer.probability:.2g})"
+        words = f"holds: no change beyond the uncertainty ({at_most}probability {answer.probability:.2g})"
         if misfit.noise[0] > NOISIER:
             words += f"; but the noise is {misfit.noise[0]:.1f} times that of the calibration"
     else:
@@ -339,7 +339,7 @@ def _words(answer: Agreement) -> str:
         words = f"no longer holds: {_cause_words(answer)}{shifts} (probability {answer.probability:.1g})"
     if misfit.many_out:
         remedy = "refit" if answer.cause in WORDS else "check labels"
-        words += f"; but {misfit.outliers} of {misfit.count} observations fit nowhere: {remedy}"
+        words += f"; but {misfit.outliers} of {misfit.count} observations do not fit: {remedy}"
     return words
 
 

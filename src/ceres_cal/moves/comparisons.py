@@ -129,7 +129,7 @@ def _camera_compared(a: Calibration, b: Calibration, name: str, other: str, with
     first, second = a.cameras[name], b.cameras[other]
     if first.image_size != second.image_size:
         sizes = " and ".join(f"{w} x {h} px" for w, h in (first.image_size, second.image_size))
-        raise InputError(f"camera {name!r}: its images are of {sizes}: calibrations of one size can be compared")
+        raise InputError(f"camera {name!r}: its images are of {sizes}: give calibrations with images of one size")
     width, height = first.image_size
     x, y = (np.linspace(0.0, n - 1.0, max(2, round(columns * n / width))) for n in (width, height))
     pixels = grid_places(x, y)

@@ -50,7 +50,7 @@ _WIDER = {
     "everything": (),
 }
 WORDS = {
-    "pose": "the lens is as it was",
+    "pose": "the lens is unchanged",
     "zoom": "the zoom was changed",
     "iris": "the lens's distortion has changed (another iris or focus)",
     "everything": "this is another lens or another camera",
@@ -90,9 +90,9 @@ def require_labels(plan: RefitPlan, poses: Mapping[str, Pose]) -> None:
         moves = None if old is None else labels_turned(pose, old.cam_from_world)
         if moves is not None and relabelled(plan.sights.observations, TURNED) is not None:
             raise SolutionError(
-                f"station {name!r}: labels are swapped, it seems: as given they put the camera {moves[0]:.2f} m from "
-                f"where it was, turned by 180 degrees {moves[1]:.2f} m: relabel with --labels turned, or confirm them "
-                "with --labels as-given"
+                f"station {name!r}: its labels seem to be swapped: as given, they move the camera by {moves[0]:.2f} m; "
+                f"turned by 180 degrees, by {moves[1]:.2f} m: correct them with --labels turned, or confirm them with "
+                "--labels as-given"
             )
 
 
@@ -104,7 +104,7 @@ def require_still(plan: RefitPlan) -> None:
             continue
         if any(one.fits for one in pose_candidates(search, [old], patience=0)):
             raise SolutionError(
-                f"station {name!r} is said to stay, but its observations say that it moved: name it with --moved, too"
+                f"station {name!r} was not named with --moved, but its observations show that it moved: name it, too"
             )
 
 
@@ -124,9 +124,9 @@ def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solutio
     """
     names = ", ".join(repr(search.sight.key.station) for search in searches)
     return _other_explanation(plan, searches) or NothingFitsError(
-        f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
-        "field: check labels, which camera and which field it is, or state sigma_px of clicks that are noisier than "
-        "what was calibrated from"
+        f"station {names}: no explanation fits: no move, no other zoom or lens, no mirrored labels, no other field. "
+        "Check the labels, the camera and the field, or state sigma_px of clicks that are noisier than those of the "
+        "calibration"
     )
 
 
@@ -280,8 +280,8 @@ def supported(
             raise other
         gain = scores[plan.what] - scores[best]
         raise OtherChangeError(
-            f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "
-            f"(better by {gain:.0f} nats)",
+            f"the data show that {WORDS[best]}{_changes(plan, best, results[best])}; the known lens explains "
+            f"them less well (by {gain:.0f} nats)",
             best,
             rivals,
         )

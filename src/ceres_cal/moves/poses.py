@@ -242,5 +242,5 @@ def moved_from(known: GaussianPrior, before: Posterior, station: str, now: Estim
 def moved_words(shift_m: float, turned_deg: float, about: str = "") -> str:
     """Return in words how far a station moved."""
     if np.isnan(shift_m):
-        return f"turned by {about}{turned_deg:.3f} deg (how far it moved is not known: its phi is not)"
+        return f"turned by {about}{turned_deg:.3f} deg (the distance is unknown, because phi is)"
     return f"moved by {about}{1e3 * shift_m:.1f} mm and {turned_deg:.3f} deg"

@@ -173,7 +173,7 @@ def make_plan(
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
     for name in chosen - stations.keys():
-        raise InputError(f"station {name!r} is to be refitted but was not observed: observed are {', '.join(stations)}")
+        raise InputError(f"station {name!r} is to be refitted but was not observed: name one of {', '.join(stations)}")
     old = calibration.estimate.stations
     for name in stations.keys() - chosen - old.keys():
         raise InputError(f"station {name!r} is to stay where it was, but the calibration has no such station")
@@ -184,8 +184,8 @@ def make_plan(
     same = calibration.digest == observations.digest  # then it is the same refit again
     if same and calibration.refitted is None:
         raise InputError(
-            "these are the observations that the calibration was made of, and it is what they say: give new ones, or "
-            "calibrate these again with what is known besides"
+            "the calibration was made from these observations, so a refit to them changes nothing: give new "
+            "observations, or calibrate again with additional priors"
         )
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # those are the old calibration's
@@ -217,7 +217,7 @@ def make_plan(
 def _turned(observations: Observations) -> Observations:
     turned = relabelled(observations, TURNED)
     if turned is None:
-        raise InputError("labels turned: some observed feature has no counterpart half a turn away: label anew")
+        raise InputError("labels turned: an observed feature has no counterpart after half a turn: correct its label")
     return turned
 
 

@@ -87,7 +87,7 @@ def refit(
     plan = make_plan(calibration, observations, what, moved, options)
     try:
         return _refitted(plan, observations, progress)
-    except OtherChangeError as change:  # reads: "the zoom was changed, the observations say", or the error
+    except OtherChangeError as change:  # reads: "the data show that the zoom was changed", or the error
         if what != "auto" or change.what == "everything":
             raise
         plan = make_plan(calibration, observations, change.what, moved, options)
@@ -144,7 +144,7 @@ def _refitted(
     return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
 
 
-_TWICE = "these observations are in the old calibration's past already: what they say counts twice now"
+_TWICE = "the old calibration was made from these observations, too: they are counted twice now"
 
 
 def _start(plan: RefitPlan) -> Estimate:
@@ -168,8 +168,8 @@ def _moved_sights(plan: RefitPlan) -> list[Sights]:
     moved = {name: sight for name, sight in plan.sights.of_world.items() if name in plan.moved}
     for name in sorted(plan.moved - moved.keys()):
         raise DegenerateError(
-            f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it "
-            "(`ceres-cal score` says how well boards alone agree with held intrinsics)"
+            f"station {name!r} sees no fixed target: observe lines or points of the field with it "
+            "(`ceres-cal score` tests held intrinsics with boards alone)"
         )
     return list(moved.values())
 
@@ -197,8 +197,8 @@ def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     if known >= _UNIQUE or any(shift_m < _SMALL[0] and turn < _SMALL[1] for shift_m, turn in moves):
         return
     raise DegenerateError(
-        f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which determine a "
-        f"small move, not a large one: show {_UNIQUE} (two a point or straight line, three an arc)"
+        f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, enough for a small "
+        f"move but not for a large one: observe at least {_UNIQUE} (a point or straight line gives two, an arc three)"
     )
 
 
@@ -216,7 +216,7 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
             )
     for name in plan.moved:
         if not np.all(np.isfinite(result.estimate.stations[name].cam_from_world.matrix)):
-            raise SolutionError(f"station {name!r}: the solve ended nowhere: check labels and target dimensions")
+            raise SolutionError(f"station {name!r}: the solved pose is not finite: check labels and target dimensions")
 
 
 def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
@@ -300,7 +300,7 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
 
 
 def _explained(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival], change: str) -> str:
-    words, moves = [f"{change}, the observations say"] if change else [], movements(plan.calibration, result, plan.what)
+    words, moves = [f"the data show that {change}"] if change else [], movements(plan.calibration, result, plan.what)
     for name in sorted(plan.moved):
         how = moved_words(*moves[name]) if name in moves else "is new"
         words.append(f"station {name!r} {how}")
@@ -332,5 +332,5 @@ def movements(before: Calibration, after: Calibration, what: str = "pose") -> di
 
 def _warnings(plan: RefitPlan, result: Calibration) -> tuple[str, ...]:
     judgement = judged(plan, plan.what, result)
-    noisy = f"the noise is {judgement.noise:.1f} times that of the calibration before"
+    noisy = f"the noise is {judgement.noise:.1f} times that of the previous calibration"
     return (*result.warnings, noisy) if judgement.noisy else result.warnings

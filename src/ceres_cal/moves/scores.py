@@ -54,7 +54,7 @@ def score(
         stations=layout.stations - known.keys(),
     )
     if not layout.size:
-        raise InputError("with its stations held nothing is left to be posed: `ceres-cal check` is for that")
+        raise InputError("with its stations held, no pose is left to solve for: use `ceres-cal check`")
     start = Start(_start(calibration, sights, known), calibration.phi_from)
     priors = gather_priors(observed, given, EXACT)
     posed = solved_from(Task(tested=False, before=layout), start, Problem(sights, layout, priors, options=given))
@@ -108,17 +108,17 @@ def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool
     size = f"to {two_digits(max(misfit.points_rms_px, misfit.curves_rms_px))} px"
     if misfit.many_out:
         out = f"{misfit.outliers} of {misfit.count} observations were taken out"
-        return False, f"is not good for these: {out}: check labels, target and camera"
+        return False, f"is not good for these observations: {out}: check labels, target and camera"
+    much = f"{two_digits(noise)} times the noise of its calibration"
     behind = [one[misfit.noise.index(noise)] for one in spare] if noise > NOISIER else []
     if behind and log_f_tail(noise**2, *behind) < np.log(FALSE_ALARMS):
-        much = f"the noise is {two_digits(noise)} times that of its calibration"
-        why = "noisier clicks or pictures, another focus, zoom or target, or too simple a lens"
-        return False, f"is not good for these, {size} only: {much}: {why}"
+        why = "the cause may be noisier clicks or pictures, another focus, zoom or target, or too simple a lens"
+        return False, f"is not good for these observations: it predicts them {size}, {much}: {why}"
     if np.isnan(noise):
-        return None, f"predicts these {size}; its calibration states no noise to compare this with"
+        return None, f"predicts these observations {size}; its calibration states no noise to compare with"
     if noise > LARGER:
-        return None, f"is usable for these, {size}, with {two_digits(noise)} times the noise that it was made with"
-    return True, f"is good for these: it predicts them {size}, as well as those that it was made from"
+        return None, f"is usable for these observations: it predicts them {size}, {much}"
+    return True, f"is good for these observations: it predicts them {size}, as well as those that it was made from"
 
 
 # ---- what is left ---------------------------------------------------------------------------------------------------

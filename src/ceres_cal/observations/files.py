@@ -320,7 +320,7 @@ def write_folder(path: Path, header: Any, columns: Mapping[str, Columns]) -> Non
         InputError: the folder exists already, or cannot be written.
     """
     if path.exists():
-        raise InputError(f"{path}: is there already: remove it, or give another name")
+        raise InputError(f"{path}: exists already: remove it, or give another name")
     beside = path.with_name(f".{path.name}.part")
     try:
         beside.mkdir()
@@ -362,8 +362,8 @@ def read_folder(path: Path, columns: Mapping[str, Column]) -> dict[str, AnyArray
         try:
             arrays[name] = np.lib.format.open_memmap(file, mode="r")
         except Exception as error:  # NumPy raises half a dozen types of errors for a broken header
-            raise InputError(f"{file}: cannot be read, it is cut short or no column ({error})") from None
+            raise InputError(f"{file}: cannot be read: it is cut short or not a column ({error})") from None
         if not arrays[name].flags.c_contiguous:
-            raise InputError(f"{file}: its rows do not lie one by one (Fortran order): save it in C order")
+            raise InputError(f"{file}: its array is in Fortran order: save it in C order")
     require_columns(arrays, columns, str(path))
     return arrays

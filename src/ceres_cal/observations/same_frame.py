@@ -10,7 +10,7 @@ from ceres_cal.base import InputError, finite, replace
 from ceres_cal.observations.columns import View
 from ceres_cal.observations.observations import Observations
 
-RULES = "'left*,right*' (what * stands for names the moment), index (in their order), or within:0.01 (numbers as names)"
+RULES = "'left*,right*' (the part at * names the moment), index (in their order), or within:0.01 (numbers as names)"
 
 _Frames = Mapping[str, tuple[str, ...]]  # names of each camera's frames, in the order of its views
 _Moments = Mapping[tuple[str, str], str]  # name of the moment, by camera and frame
@@ -42,7 +42,7 @@ def with_same_frames(observations: Observations, rule: str) -> Observations:
     else:
         moments = _by_pattern(frames, rule.split(","))
     if len(set(moments.values())) == len(moments):
-        raise InputError(f"same frames by {rule!r}: no two cameras have one in common: say them by {RULES}")
+        raise InputError(f"same frames by {rule!r}: no two cameras have a frame in common: match frames by {RULES}")
     return replace(observations, views=tuple(_renamed(view, moments) for view in observations.views))
 
 
@@ -54,7 +54,7 @@ def _renamed(view: View, moments: _Moments) -> View:
 def _by_index(frames: _Frames) -> _Moments:
     if len({len(names) for names in frames.values()}) > 1:
         counts = ", ".join(f"{camera!r} has {len(names)}" for camera, names in frames.items())
-        raise InputError(f"same frames by index: {counts} frames (one was not found?): say them by {RULES}")
+        raise InputError(f"same frames by index: {counts} frames (one was not found?): match frames by {RULES}")
     return {(camera, name): f"{n:04d}" for camera, names in frames.items() for n, name in enumerate(names, start=1)}
 
 
@@ -71,7 +71,7 @@ def _by_pattern(frames: _Frames, patterns: Iterable[str]) -> _Moments:
             fits = {found[1] for shape in shapes if (found := shape.fullmatch(name))}
             if len(fits) != 1:
                 how = "several patterns fit" if fits else "no pattern fits"
-                raise InputError(f"same frames: {how} frame {name!r} of camera {camera!r}: say them by {RULES}")
+                raise InputError(f"same frames: {how} frame {name!r} of camera {camera!r}: match frames by {RULES}")
             moments[camera, name] = fits.pop()
     return moments
 
@@ -84,7 +84,7 @@ def _within(frames: _Frames, rule: str) -> _Moments:
         apart = min((b - a for a, b in pairwise(ordered)), default=float("inf"))
         if not 0.0 <= most < 0.5 * apart:
             raise InputError(
-                f"same frames by {rule!r}: it must be below half of the {apart:g} between frames of camera {camera!r}"
+                f"same frames by {rule!r}: must be below half of {apart:g}, the interval of frames of camera {camera!r}"
             )
     moments: dict[tuple[str, str], str] = {}
     first_seen: list[tuple[float, str]] = []

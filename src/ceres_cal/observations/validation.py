@@ -53,7 +53,7 @@ def require_alike(content: Content) -> None:
     kind, number = ("point", row) if row < len(content.points) else ("curve", row - len(content.points))
     raise InputError(
         f"{view_label(columns[kind].view[number], content.views)}, {kind} {content.feature_name(kind, number)!r}: its "
-        f"sigma_px is {sigmas[row]:g} where {usual_px:g} is usual: sigmas may differ by a factor of {_SIGMA_RATIO:.0f} "
+        f"sigma_px is {sigmas[row]:g}, but {usual_px:g} is usual: sigmas may differ by a factor of {_SIGMA_RATIO:.0f} "
         "at most: correct it, or leave the observation out"
     )
 
@@ -91,7 +91,7 @@ def stray_pixels(content: Content) -> tuple[str, ...]:
             ]
             raise InputError(
                 f"camera {camera!r}: its image is {size[0]} x {size[1]} px, but {_first(content, *far)} lies "
-                f"{_FAR:.0f} images away: correct or remove it"
+                f"{_FAR:.0f} image diagonals away: correct or remove it"
             )
         text = f"camera {camera!r}: {count} of {total} observations lie outside its image"
         if count > max(1.0, _FEW * total):
@@ -131,7 +131,7 @@ def _cause(pixels: Array, size: Sequence[int]) -> str:
     reach = f"pixels reach {right:.0f} x {bottom:.0f} but image_size is {width} x {height}"
     if width != height and np.all((right, bottom) <= _end((height, width))):
         return f"{reach}: width and height, or x and y, are swapped: correct that"
-    return f"{reach}: another image size? Give that of the pictures the pixels were measured in"
+    return f"{reach}: give the size of the pictures in which the pixels were measured"
 
 
 def _first(content: Content, points: Mask, curves: Mask) -> str:
@@ -168,8 +168,8 @@ def unfilled(content: Content, corner: float = 0.25) -> Iterator[str]:
     for camera in _within(content, reach, corner):
         (width, height), size = reach[camera], content.cameras[camera]
         yield (
-            f"camera {camera!r}: observations reach {width:.0f} x {height:.0f} px of an image of {size[0]} x "
-            f"{size[1]}: is image_size that of the pictures?"
+            f"camera {camera!r}: observations reach only {width:.0f} x {height:.0f} px of an image of {size[0]} x "
+            f"{size[1]}: check that image_size is the size of the pictures"
         )
 
 
@@ -187,8 +187,8 @@ def odd_sizes(content: Content) -> Iterator[str]:
         if size_m > _LARGE_M:
             yield f"target {name!r} is {size_m:.0f} m large: are its numbers metres, or millimetres?"
         elif target.reach_m > _REMOTE_M:
-            away = f"{1e-3 * target.reach_m:.0f} km from the origin of its numbers"
-            yield f"target {name!r} lies {away}, which costs digits: give them from an origin near it"
+            away = f"{1e-3 * target.reach_m:.0f} km from its coordinate origin"
+            yield f"target {name!r} lies {away}, which loses precision: use an origin near it"
 
 
 # ---- observations that are there twice ------------------------------------------------------------------------------
@@ -235,7 +235,7 @@ class Copies(Frozen):
         twice = {frame: count for (frame, first), count in rows.items() if frame == first}
         if twice:
             frame = first_of(list(map(repr, twice)))
-            yield f"{sum(twice.values())} observations of frame {frame} are there more than once: counted once"
+            yield f"{sum(twice.values())} observations of frame {frame} are repeated: counted once"
 
 
 def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies:

@@ -68,15 +68,15 @@ def valley(
         first = _node(camera, problem, _ahead(camera, first, phi), inflation)
     if first is None or least is None or first.cost - least.cost > _FAR:
         raise SolutionError(
-            f"camera {camera!r}: the least cost lies at phi {estimate.cameras[camera].phi:.1f} px, which is no lens: "
+            f"camera {camera!r}: the lowest cost is at phi {estimate.cameras[camera].phi:.1f} px, which is impossible: "
             "check labels and dimensions, add a prior on height_m or phi, or boards tilted by 20 degrees"
         )
     far = max(_FAR, 2.0 * half_width**2)
     down, up = (list(_walk(camera, problem, first, direction, inflation, far)) for direction in (-1, +1))
     if not (down or up):
         raise SolutionError(
-            f"camera {camera!r}: no other phi beside {phi:.1f} px can be solved for, so nothing says how far it is "
-            "known: check labels and dimensions, add observations, or a prior on height_m or phi"
+            f"camera {camera!r}: the solve fails at every phi other than {phi:.1f} px, so its uncertainty is "
+            "unknown: check labels and dimensions, add observations, or a prior on height_m or phi"
         )
     return (*down[::-1], first, *up)
 

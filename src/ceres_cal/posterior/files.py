@@ -82,7 +82,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
         numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), tuple(every)
         valley = self.phi_px, self.open_below, self.open_above
         if any(len(one) not in (2, 3) for one in self.lenses):
-            raise InputError(f"{where}.lenses: of each component its lens and the one that is alike: calibrate again")
+            raise InputError(f"{where}.lenses must give each component a lens and a similar one: calibrate again")
         lenses = {one[0]: (one[1], one[2] if one[2:] else 0) for one in self.lenses}  # pairs are in older files
         return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, lenses)
 
@@ -175,7 +175,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             for mixture in mixtures.values()
             for component, (lens, alike) in mixture.lenses.items()
         ):
-            raise InputError("posterior.mixtures names lenses that posterior.lenses has not: calibrate again")
+            raise InputError("posterior.mixtures names lenses that are not in posterior.lenses: calibrate again")
         return Posterior(information, placements, freedom, mixtures, by_model or None, self.dependence, stated, lenses)
 
 

@@ -53,7 +53,7 @@ def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tupl
         InputError: no such station, or one that was held, so that its pose in the world is unknown.
     """
     if not posterior.knows_station(estimate.station_name(station)):
-        raise InputError(f"station {station!r} was held as the world: it has no map of a field: observe one with it")
+        raise InputError(f"station {station!r} defines the world, so it has no map of a field: observe a field with it")
     return posterior.keys_of(estimate, station)
 
 

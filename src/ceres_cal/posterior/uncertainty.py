@@ -209,7 +209,8 @@ class Uncertainty(Frozen):
         parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
         many, names = len(keys) > 1, " and ".join(parts)
         if relative >= 1.0:  # known to its own size or worse: a percentage would say nothing
-            return f"{'nothing' if np.isinf(relative) else 'hardly anything'} tells {names}{' apart' if many else ''}"
+            how = "do not" if np.isinf(relative) else "hardly"
+            return f"the observations {how} {'separate' if many else 'determine'} {names}"
         return f"{names}{' trade off: each' if many else ':'} known to {two_digits(100.0 * relative)} % only"
 
     @cached_property
@@ -242,7 +243,7 @@ class Uncertainty(Frozen):
         dependence, factor = self.posterior.dependence, median(self.posterior.factors)
         if dependence is None or not dependence.causes or factor < widened:
             return ""
-        return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
+        return f"{' and '.join(dependence.causes)}: this makes standard deviations {two_digits(factor)} times as large"
 
     def ratio_sd(self, station: str) -> float:
         """Relative standard deviation of phi over the station's height: a view from straight above determines this

@@ -17,7 +17,7 @@ from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, CachedCost, EliminatedC
 from ceres_cal.problem.parameters import Estimate, Layout, Station, charts_of, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.problem import Problem, Weighting
 
-_NOTHING_LEFT = "Nothing left to gain."
+_NOTHING_LEFT = "The cost cannot decrease any further."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
 # Relative change of a placement's cost that an initial estimate may leave. Halving or doubling changes nothing.
 _POSED = 1e-2
@@ -209,7 +209,7 @@ def solve(
     try:
         solved = _unpacked(blocks, estimate, layout)
     except InputError as error:  # phi or aspect below 0
-        raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
+        raise SolutionError(f"the solve gave no camera ({error}): check labels and target dimensions") from None
     for cost in costs:
         if isinstance(cost, EliminatedCost):
             solved = solved.with_placements(*cost.converged([blocks[owner] for owner in cost.owners]))
@@ -266,8 +266,8 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
     if problem.equations + known < unknowns:
         observed = 2 * len(problem.observations.points) + len(problem.observations.curves)
         others = (
-            f"; of the {observed} that were observed the others agree with no camera: check the names of features, and "
-            "whether pixels are x, y from the top left"
+            f"; no camera explains the others of the {observed} that were observed: check the names of features, and "
+            "that pixels are x, y from the top left"
         )
         raise DegenerateError(
             f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "

@@ -110,7 +110,7 @@ class Options(Frozen, eq=True):
             left_open = () if lens_class(self.lens).set_at_start else PAPERS_POWERS
             object.__setattr__(self, "powers", tuple(self.powers) or left_open)
         elif self.terms:
-            raise InputError("terms are of a lens that is named: leave them out, or name it")
+            raise InputError("terms need a named lens: leave them out, or name the lens")
         if self.loss not in LOSSES:
             raise InputError(no_such("loss", self.loss, LOSSES))
         if self.noise_scale not in ("estimate", "stated"):

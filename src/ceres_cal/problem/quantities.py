@@ -296,7 +296,7 @@ class Range(Frozen, eq=True):
             return
         bound = f"at most {self.most:.3g}" if value > self.most else f"at least {self.least:.3g}"
         unit = f" {self.unit}" if self.unit else ""
-        raise InputError(f"{what} is {value:g}{unit}, but it is {bound}{unit}: {self.why}{self._in_mm(value)}")
+        raise InputError(f"{what} is {value:g}{unit}, but must be {bound}{unit}: {self.why}{self._in_mm(value)}")
 
     def require_sigma(self, sigma: float, what: str) -> None:
         """Raise InputError if a standard deviation is smaller than anything measured; `what` names the number."""
@@ -362,7 +362,7 @@ def camera_ranges(quantity: str, image_size: tuple[int, int], lens: Lens | None)
 
 def dimension_range(drawn_m: float) -> Range:
     """The range of a target's dimension, relative to its drawing."""
-    why = f"the target is drawn with {drawn_m:g} m"
+    why = f"the target states {drawn_m:g} m"
     return Range(drawn_m / _REDRAWN, drawn_m * _REDRAWN, "m", FINEST, why)
 
 
@@ -388,9 +388,9 @@ def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Ran
     if name == "aspect":
         return Range(*aspect, "", finest_ratio, "it is fy / fx, near 1")
     if name == "skew":
-        return Range(*skew, "", finest_ratio, "it is 0 unless columns of pixels lean")
+        return Range(*skew, "", finest_ratio, "it is 0 where pixel axes are perpendicular")
     scale = 1.0 if lens is None or name not in lens.names else lens.scales(half)[lens.names.index(name)]
-    return Range(-coefficient / scale, coefficient / scale, "", finest_ratio / scale, "more bends no image")
+    return Range(-coefficient / scale, coefficient / scale, "", finest_ratio / scale, "no lens bends more")
 
 
 def _of_place(station: str, observations: Observations) -> tuple[Range, Range, Range]:
@@ -433,10 +433,10 @@ def place_ranges(seen: Array, spread: float, said: str, floor_m: float | None) -
     """
     size_m = 2.0 * float(np.linalg.norm(seen.max(axis=0) - seen.min(axis=0)))  # the places have half of an arc
     most_m = 0.5 * PHI_RANGE[1] * size_m / spread + float(np.max(np.linalg.norm(seen, axis=1)))
-    place = Range(-most_m, most_m, "m", FINEST, f"no lens shows its target {said} large from farther away")
+    place = Range(-most_m, most_m, "m", FINEST, f"from farther away no lens shows its target {said} large")
     if floor_m is None:
         return place, place, place
-    why = f"the camera sees its floor from above, where z points, and {place.why}"
+    why = f"z points upwards, the camera is above its floor, and {place.why}"
     return place, place, replace(place, least=min(floor_m, 0.0) + FINEST, why=why)
 
 

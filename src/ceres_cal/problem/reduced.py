@@ -294,8 +294,8 @@ def _kernel_normals(sights: Sights, problem: Problem, estimate: Estimate) -> Cal
 
         if not all(run_parts(part, parts_of(last - first, int(rows * (last - first)), NORMAL_NS))):
             raise SolutionError(
-                "an observation cannot be projected where the solve ended: no uncertainty can be given: choose another "
-                "lens (for wide ones kannala-brandt or spline), free what is held of this one, or leave out what lies "
+                "the solved camera cannot project an observation, so no uncertainty can be given: choose another lens "
+                "(kannala-brandt or spline for wide ones), do not hold its numbers, or leave out the observations "
                 "nearest to the image's corners"
             )
         return normals if chain is None else chain.T @ normals @ chain

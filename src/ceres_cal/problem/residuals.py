@@ -303,7 +303,7 @@ def write_equations(sights: Sights, estimate: Estimate, there: Residuals) -> Equ
     x, y = there.points.T
     sights = sights.used(np.isfinite(x + y), np.isfinite(there.curves))
     if not len(sights):
-        raise SolutionError("the calibration can show none of the observations: give those it was made from")
+        raise SolutionError("the calibration cannot project any of the observations: give those that it was made from")
     return equations_of(sights, estimate, there)
 
 

@@ -230,7 +230,7 @@ def make_structure(
     drawn_m, slopes = dimension_slopes(names, targets, dimensions)
     for name, column in zip(dimensions, slopes.T, strict=True):
         if not np.any(column):
-            raise InputError(f"no line or point lies elsewhere with another {name}: it cannot be solved for")
+            raise InputError(f"no line or point depends on {name}: it cannot be solved for")
     moved = np.any(slopes != 0.0, axis=1) | (np.arange(len(slopes)) < len(free))
     place = np.full(len(every), -1, dtype=np.int32)
     place[order[moved]] = np.arange(np.count_nonzero(moved))
@@ -248,8 +248,8 @@ def _tolerated(name: str, target: Target, tolerance: Tolerance) -> tuple[list[st
     """Names and tolerances of all offsets that a target may have, in the order of the solver's numbers."""
     if max(tolerance.warp_m, tolerance.heights_m, tolerance.stretch_m) > 0.0 and not target.bows:
         raise InputError(
-            "a warp, heights or a stretch are for checkerboards and boards like them: "
-            f"target {name!r}, of kind {target.kind!r}, does not bow"
+            "warp_m, heights_m and stretch_m are for checkerboards and similar boards only: "
+            f"target {name!r} is of kind {target.kind!r}"
         )
     curves = [(one, part) for one, curve in target.curves.items() for part in _parts_of(curve)]
     names = [

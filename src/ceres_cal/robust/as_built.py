@@ -324,14 +324,14 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
         ]
     if unseen:
         raise DegenerateError(
-            f"nothing that was observed depends on {unseen[0].quantity} of target {unseen[0].owner!r}: "
+            f"no observation depends on {unseen[0].quantity} of target {unseen[0].owner!r}: "
             "it cannot be solved for: leave it out"
         )
     open_ = [key for key, one in zip(keys, sd, strict=True) if not one < _UNMEASURED * lengths[key.structure_name]]
     if open_:
         names = ", ".join(key.quantity for key in open_)
         raise DegenerateError(
-            f"nothing says how large target {open_[0].owner!r} is, since all of {names} are to be solved for: measure "
+            f"the size of target {open_[0].owner!r} is unknown, because all of {names} are to be solved for: measure "
             f"one of them (--estimate {open_[0].quantity}=VALUE:SIGMA), another length of it, or a camera's height "
             "(--prior height_m=VALUE:SIGMA)"
         )

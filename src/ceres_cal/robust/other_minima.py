@@ -285,8 +285,8 @@ def seen_alike(
             first, second = (f"({', '.join(f'{value:.2f}' for value in place)}) m" for place in (here, there))
             yield (
                 (
-                    f"station {name!r}: what it shows is seen alike from {first} and from {second}"
-                    f"{', where it shows other places on the floor' if apart else ''}: add a point or a line, or the "
+                    f"station {name!r}: its observations fit equally well from {first} and from {second}"
+                    f"{', with other places on the floor' if apart else ''}: add a point or a line, or the "
                     "camera's height as a prior"
                 ),
                 bool(apart),

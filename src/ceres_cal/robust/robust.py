@@ -236,7 +236,7 @@ class _RowRounds(Rounds[RobustSolution]):
         problem = replace(self._problem.rough(weighting), feet=there.feet).used(visible.points, visible.curves)
         if not len(problem.sights):
             raise DegenerateError(
-                "the observations fix no pose that could show them: add points or lines of the targets"
+                "the observations determine no pose that explains them: add points or lines of the targets"
             )
         few = problem.of_sights(_evenly(problem))
         if problem.options.is_rough and len(few.sights) < len(problem.sights):

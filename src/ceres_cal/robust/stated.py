@@ -227,7 +227,7 @@ def doubted(statement: Statement, test: WaldTest, alone: bool, probability: floa
 def may_be_wrong(conflict: Conflict, key: Key, probability: float, lens: str) -> str:
     """The words for a statement that is in conflict under another lens and may be wrong."""
     stated = number_text(conflict.stated, conflict.stated_sd, key)
-    seen = f"with the lens {lens} everything else says {number_text(conflict.seen, conflict.seen_sd, key)}"
+    seen = f"with the lens {lens} everything else gives {number_text(conflict.seen, conflict.seen_sd, key)}"
     return f"the {_STATED[conflict.kind]} {key.quantity} of {key.whose}, {stated}: {seen}. It {_wrong_by(probability)}"
 
 
@@ -237,7 +237,7 @@ def _wrong_by(probability: float) -> str:
 
 
 def _apart(statement: Statement, test: WaldTest, alone: bool) -> str:
-    key, who = test.key, "the observations alone say" if alone else "everything else says"
+    key, who = test.key, "the observations alone give" if alone else "everything else gives"
     about = f"{_STATED[statement.kind]} {key.quantity} of {key.whose}, {number_text(*test.stated, key)}"
     return f"the {about}: {who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
 

@@ -58,14 +58,13 @@ from ceres_cal.robust.robust import RobustSolution
 MOVES, ROLLING = "principal point moves", "rolling shutter"
 _KINDS = (MOVES, ROLLING)
 _MOVES_WORDS = (
-    "its principal point moves by {px} px from view to view, as where a lens or pictures are stabilised (most "
-    "displaced are corners of {named}). The point that is stated is the average; in a single picture it may be as far "
-    "from there. Switch stabilisation off"
+    "its principal point moves by {px} px from view to view, as with optical or digital stabilisation (corners move "
+    "most in {named}). The stated point is the average; that of a single picture may differ by as much. Switch "
+    "stabilisation off"
 )
 _ROLLING_WORDS = (
-    "its pictures are bent by {px} px rms, each in its own way, as where rows are read out one after the other "
-    "(rolling shutter) while the camera or the target moves (most in {named}). A place in a single picture may be as "
-    "far off. Hold both still"
+    "its pictures are distorted by {px} px rms, each differently, as by a rolling shutter while the camera or the "
+    "target moves (most in {named}). A point in a single picture may be off by as much. Hold both still"
 )
 # Coefficients of a view, in their order: name, number and prior. The smooth displacements of all views come last.
 _CENTRE_OF_VIEW, _READ_OUT, _TURNS = "principal point", "read-out", "read-out, turns"

@@ -47,9 +47,9 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
         met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
         met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
         if 2 * met < len(own.point_rows) + len(own.curve_rows):
-            count, checks = own.equations, "check labels, target dimensions and which lens it is"
+            count, checks = own.equations, "check labels, target dimensions and the lens"
             few = count < 4 * (len(camera.lens.values) + 10)  # equations for a camera and its pose: too few to decide
-            what = f"show it more of the targets, which it has only {count} numbers of, or {checks}" if few else checks
+            what = f"show it more of the targets (only {count} numbers are measured), or {checks}" if few else checks
             missed = f"the best solution misses half of its observations by more than {limit_px:.0f} px"
             raise SolutionError(f"camera {name!r}: {missed}: {what}", name)
 
@@ -96,7 +96,7 @@ def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
     behind = np.count_nonzero(~np.isfinite(lengths))
     if 2 * behind > len(lengths):
         raise SolutionError(
-            f"station {station!r}: {behind} of the {len(lengths)} observations it has of the world lie behind the "
+            f"station {station!r}: {behind} of its {len(lengths)} observations of fixed targets lie behind the "
             "camera or beyond its lens: check labels and target dimensions"
         )
 
@@ -118,7 +118,7 @@ def _cause(camera: Camera) -> str:
     sizes = np.array([[width, height], [height, width]])
     off, other = np.linalg.norm(camera.principal_point - (sizes - 1.0) / 2.0, axis=1)
     if other < _NEARER * off:
-        return "x and y are swapped (its principal point is where that puts it)"
+        return "x and y are swapped (its principal point shows this)"
     swapped = "x and y are swapped" + (", image_size too" if off < _NEARER * other else "")
     return f"the image is mirrored, or {swapped}, or y points upwards"
 
@@ -161,8 +161,8 @@ def require_usable(
             warnings.append(
                 f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image of {width} x "
                 f"{height} px, of which observations reach {reach[0]:.0f} x {reach[1]:.0f}: "
-                "is image_size that of the pictures, are pixels counted from their top-left corner, and is x, not y, "
-                "the first?"
+                "check that image_size is the size of the pictures, that pixels count from their top-left corner, and "
+                "that x comes before y"
             )
         if not camera.folds:
             continue
@@ -175,7 +175,7 @@ def require_usable(
                 name,
             )
         warnings.append(
-            f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
+            f"{where}: pixels from there to the corner ({corner:.0f} px) cannot be undistorted; "
             f"observations reach {observed.reach_px:.0f} px"
         )
     return (*warnings, *_lost(end.inliers, problem, groups))

@@ -195,7 +195,7 @@ class Camera(Frozen, eq=True):
         far_m = 10.0  # a height above this, and far above the camera, is in millimetres
         if abs(height_m) > max(far_m, 2.0 * abs(self.position[2])):
             raise InputError(
-                f"height_m {height_m:g} is in metres, and the camera's is {self.position[2]:.2f}: "
+                f"height_m is {height_m:g} m, but the camera's height is {self.position[2]:.2f} m: "
                 f"for {height_m:g} mm give {1e-3 * height_m:g}"
             )
         if np.ndim(pixels) == 1:
@@ -337,7 +337,7 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
         camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect, skew=self.skew or 0.0)
         if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
-            raise InputError("camera_matrix is another than that of phi, aspect, skew and principal_point: correct one")
+            raise InputError("camera_matrix disagrees with phi, aspect, skew and principal_point: correct one")
         return camera
 
 

@@ -204,11 +204,11 @@ class ForeignCamera(Frozen):
         inside = np.all((seen >= -0.5) & (seen <= np.array([width, height]) - 0.5), axis=2)
         chosen = growing & inside
         if np.count_nonzero(chosen) < 20:
-            raise InputError(f"its {self.model} model shows nothing of its image: correct its numbers")
+            raise InputError(f"its {self.model} model projects nothing into its image: correct its numbers")
         pixels, shown = seen[chosen], rays[chosen]
         fits = [fit for lens in _LENSES if (fit := lens_fitted(self, lens, shown, pixels)) is not None]
         if not fits:
-            raise InputError(f"no lens of ours is near its {self.model} model: correct its numbers")
+            raise InputError(f"no lens of ceres-cal approximates its {self.model} model: correct its numbers")
         camera, error_px = min(fits, key=lambda fit: fit[1][0])
         return camera.at(pose), error_px
 
@@ -286,7 +286,7 @@ def nearest(camera: Camera, lens: Lens) -> Camera:
     known = rays[:, 2] > 0.0
     fit = lens_fitted(start, lens, rays[known], pixels[known])
     if fit is None:
-        raise InputError(f"no {lens.kind} lens is near: it would fold over inside the image")
+        raise InputError(f"no {lens.kind} lens approximates this camera: it would fold over inside the image")
     return fit[0].at(camera.cam_from_world)
 
 

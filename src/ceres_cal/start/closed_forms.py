@@ -82,7 +82,7 @@ def homography_from_points(plane_points: ArrayLike, image_points: ArrayLike) -> 
     rows = np.vstack([np.hstack([u[:, 2:] * x, zero, -u[:, :1] * x]), np.hstack([zero, u[:, 2:] * x, -u[:, 1:2] * x])])
     _, s, vt = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])
     if s[7] <= 1e-9 * s[0]:
-        raise DegenerateError(f"of any four of the {len(plane)} points three lie on one line: add points beside it")
+        raise DegenerateError(f"three of any four of the {len(plane)} points lie on one line: add points off it")
     h = np.linalg.inv(scale) @ vt[-1].reshape(3, 3) @ t
     return facing(h, plane, image)
 
@@ -93,7 +93,7 @@ def require_spread(plane_points: Array) -> None:
         raise DegenerateError(f"{len(plane_points)} points cannot fix a plane's pose: give at least four")
     spread = np.linalg.svd(plane_points - plane_points.mean(axis=0), compute_uv=False)
     if spread[-1] <= 1e-7 * spread[0]:
-        raise DegenerateError(f"all {len(plane_points)} points lie on one line: add points beside it")
+        raise DegenerateError(f"all {len(plane_points)} points lie on one line: add points off this line")
 
 
 def facing(homography: Array, plane_points: Array, image_points: Array) -> Array:

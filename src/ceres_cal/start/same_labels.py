@@ -40,8 +40,8 @@ class Labels(Frozen, eq=True):
 def open_words(station: str) -> str:
     """The message about a station whose labels cannot be decided."""
     return (
-        f"station {station!r}: nothing shows which way round its boards are labelled: show the board to it and to the "
-        "first camera at once in more poses, or take a board of odd columns + rows"
+        f"station {station!r}: it is unknown whether its boards are labelled the other way round: show the board to it "
+        "and to the first camera at once in more poses, or use a board whose columns + rows are odd"
     )
 
 
@@ -69,8 +69,8 @@ def listed_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
     compared = attempt(lambda: list(_beside_the_first(observations, _listings)))
     return {
         (station, placement): (
-            f"its points are {'mirrored' if turn.rotation[2, 2] < 0.0 else 'turned'} against those that other cameras "
-            "see: list them in the same order"
+            f"its points are {'mirrored' if turn.rotation[2, 2] < 0.0 else 'turned'} relative to those of other "
+            "cameras: list them in the same order"
         )
         for station, turns in ([] if isinstance(compared, CalibrationError) else compared)
         for placement, turn in (turns or {}).items()

@@ -19,8 +19,8 @@ from ceres_cal.start.same_labels import Both, apart, beside_the_first, is_clearl
 
 _FEWEST = 4  # moments from which on the cameras can be compared: of three, two agree by chance
 _ADVICE = (
-    "they are not of the same moment, or a camera was moved: take all of them at once, hold the board still meanwhile, "
-    "or leave frames that several cameras show to one of them"
+    "the pictures were not taken at the same moment, or a camera was moved: take them all at once, hold the board "
+    "still meanwhile, or keep each shared frame of one camera only"
 )
 
 
@@ -42,7 +42,7 @@ def require_same_moments(problem: Problem, estimate: Estimate) -> str:
     if times < named:
         return ""
     stations = " and ".join(map(repr, problem.observations.stations))
-    words = f"at most moments {stations} see a board at different places, {times:.1f} times the noise apart"
+    words = f"in most frames {stations} see the board at different places, {times:.1f} times the noise apart"
     if times > refused:
         raise SolutionError(f"{next(shifted(problem.observations), words)}: {_ADVICE}")
     return f"{words}: {_ADVICE}"
@@ -76,8 +76,8 @@ def shifted(observations: Observations) -> Iterator[str]:
         if is_clearly_more(costs[0], costs[best]) and costs[best] < alike:
             where = f"{counted(abs(best), 'frame')} {'later' if best > 0 else 'earlier'}"
             yield (
-                f"{moments.first!r} and {moments.second!r} do not show the same moments: what {moments.first!r} shows "
-                f"in a frame {moments.second!r} shows {where}"
+                f"frames of {moments.first!r} and {moments.second!r} are shifted: what {moments.first!r} shows in a "
+                f"frame, {moments.second!r} shows {where}"
             )
 
 

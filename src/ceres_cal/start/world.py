@@ -112,7 +112,7 @@ def placed(
         mirrored, _, other = best((-1.0, 1.0))
         if holds(mirrored, other) and other.costs[0] + _ALIKE < found.costs[0]:
             raise InputError(
-                f"station {sight.keys[0].station!r}: what it sees of the floor is a mirrored picture: x and y are "
+                f"station {sight.keys[0].station!r}: its picture of the floor is mirrored: x and y are "
                 "swapped, or y points upwards, or left and right are exchanged in the labels: correct the observations"
             )
     return _answered(*_at_rest(sight, lines, chosen, found))
@@ -299,7 +299,7 @@ def chained_poses(
 def _what_poses(sight: Sights) -> str:
     """The advice where no pose of a sight is found."""
     if len(sight.points) > 3 and np.linalg.matrix_rank(sight.points - sight.points[0]) > 1:
-        return "none shows its points through this lens: check its labels, try another lens"
+        return "no pose explains its points with this lens: check its labels, or try another lens"
     return "give at least four points, not on one line, or straight lines in two directions, two of each"
 
 
@@ -319,7 +319,7 @@ def _require_all(
         if names := open_numbers.get(number, ()):
             stated = [_STATED[name] for name in names if name in _STATED]
             state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""
-            what = f"{', '.join(names)} of the camera stay open: add a point or a line beside these{state}"
+            what = f"{', '.join(names)} of the camera are not determined: add another point or line{state}"
         else:
             what = _what_poses(sight)
         text = f"frame {frames} ({key}): {said}: {what}, or remove the view"

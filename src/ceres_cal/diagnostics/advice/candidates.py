@@ -248,7 +248,7 @@ def _pole(station: str, mark: str, x: float, y: float, top: float) -> Measuremen
     frames = tuple(f"{name}_{number:02d}" for number in range(1, _FRAMES + 1))
     return Measurement(
         "pole",
-        f"{where}, its top {top:.2f} m over the field",
+        f"{where}, its top {top:.2f} m above the field",
         targets={name: custom({"top": (x, y, top)})},
         tolerances={name: Tolerance(points_m=POLE_SIGMA_M)},
         views=(ViewPlan(frames, station, name),),
@@ -296,7 +296,7 @@ def boards(search: CandidateSearch) -> Iterator[Measurement]:
                         label = f"advised_{share:.1f}_{pixel[0]:.0f}_{pixel[1]:.0f}_{tilt:.0f}_{edge}"
                         words = (
                             f"middle at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), {distance:.2f} m from the camera, "
-                            f"tilted by {tilt:.0f} deg, its {edge} edge nearer"
+                            f"tilted by {tilt:.0f} deg with its {edge} edge nearer"
                         )
                         yield Measurement(
                             "board",
@@ -346,7 +346,7 @@ def frames(search: CandidateSearch) -> Iterator[Measurement]:
     for name, target in still(search.ground.targets).items():
         if search.curves_observed and target.curves:
             plan = ViewPlan(names, search.station, name, None, (), None, _FRAME_SPACING_M)
-            what = f"every line, a point each {1e3 * _FRAME_SPACING_M:.0f} mm"
+            what = f"every line, one point every {1e3 * _FRAME_SPACING_M:.0f} mm"
         elif target.points:
             plan, what = ViewPlan(names, search.station, name, None, None, ()), "every point"
         else:

@@ -151,7 +151,7 @@ def _prepared(calibration: Calibration, station: str | None, height_m: float) ->
     """Return the ground and the outlook, both of the numbers that a measurement at this station can determine."""
     known = calibration.uncertainty
     if not still(calibration.targets):
-        raise InputError("advice is about a map of a field, and there is none: nothing that was observed stands still")
+        raise InputError("advice needs the map of a field, but all targets are movable: observe a field")
     today = known.map_sd_mm(station, height_m)
     if not np.any(today.sd_mm >= 0.0):
         raise InputError(f"station {today.station!r} sees nothing of the field at {1e3 * height_m:.0f} mm")
@@ -179,7 +179,7 @@ def _weighting(fit: Fit, camera: str) -> Weighting:
     """
     points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
-        raise InputError("the calibration found no noise at all: advice would promise miracles")
+        raise InputError("the calibration's noise is 0, so advice is impossible: use measured pixels")
     own = max((factor for name, factor in fit.of_cameras.items() if f"{name}/".startswith(f"{camera}/")), default=1.0)
     return Weighting(own * points, own * curves, "trivial")
 

@@ -96,9 +96,9 @@ def _leaning(case: Case, camera: str, pixels: Array) -> Array | None:
 def _of_skew(evidence: Evidence) -> Words:
     skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
     return evidence.words(
-        f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad",
-        "calibrate with --free-skew, which no other program reads; better take pictures as the sensor gives them, "
-        "neither warped nor stabilised",
+        f"camera {evidence.score.subject!r}: its pixel axes are not perpendicular, by {skew[0]:.2f} ± {sd[0]:.2f} mrad",
+        "take pictures as the sensor gives them, neither warped nor stabilised, or calibrate with --free-skew, which "
+        "no other program can read",
         ["skew"],
         "mrad",
     )
@@ -116,7 +116,7 @@ def _of_aspect(evidence: Evidence) -> Words:
     score = evidence.score
     held = evidence.case.estimate.cameras[score.subject].aspect
     return evidence.words(
-        f"camera {score.subject!r}: its pixels are not as wide as high: aspect {held + score.amount[0]:.5f} ± "
+        f"camera {score.subject!r}: its pixels are not square: aspect {held + score.amount[0]:.5f} ± "
         f"{score.sd[0]:.5f}, not {held:g}",
         "calibrate with --free-aspect",
         ["aspect"],
@@ -126,19 +126,19 @@ def _of_aspect(evidence: Evidence) -> Words:
 
 def _of_principal_point(evidence: Evidence) -> Words:
     x, y = evidence.score.amount
-    asked = f"the residuals ask for it {x:+.1f}, {y:+.1f} px from there"
+    asked = f"the residuals indicate an offset of {x:+.1f}, {y:+.1f} px"
     sentence = f"camera {evidence.score.subject!r}: the principal point is held, but {asked}"
-    return evidence.words(sentence, "let it free", ["cx", "cy"])
+    return evidence.words(sentence, "solve for it", ["cx", "cy"])
 
 
 def _of_phi(evidence: Evidence) -> Words:
     score = evidence.score
-    asked = f"residuals ask for {score.amount[0]:+.2f} ± {score.sd[0]:.2f} px"
+    asked = f"the residuals indicate a change of {score.amount[0]:+.2f} ± {score.sd[0]:.2f} px"
     sentence = f"camera {score.subject!r}: phi is held, but {asked}"
-    return evidence.words(sentence, "let it free, or give it as a prior with a sigma", ["phi"])
+    return evidence.words(sentence, "solve for it, or give it as a prior with a sigma", ["phi"])
 
 
-_HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
+_HALF = "the half pixel suggests that one counts from the corner of the top-left pixel: "
 
 
 def _shifted(case: Case) -> Iterator[EffectColumns]:
@@ -180,7 +180,7 @@ def _drawn_out(case: Case, camera: str, pixels: Array) -> Array | None:
 
 def _of_coma(evidence: Evidence) -> Words:
     px, sd = evidence.score.amount, evidence.score.sd
-    drawn = f"draws everything outwards by {px[0]:+.2f} ± {sd[0]:.2f} px at the corners of the image"
+    drawn = f"displaces everything outwards by {px[0]:+.2f} ± {sd[0]:.2f} px at the corners of the image"
     sentence = f"camera {evidence.score.subject!r}: its lens has coma, which {drawn}"
     return evidence.words(sentence, "stop the lens down, or take another one", ["coma"])
 

@@ -31,10 +31,10 @@ def _of_radius(evidence: Evidence) -> Words:
     case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
     if case.estimate.cameras[name].lens.roughness:
         return Words(
-            f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px "
-            f"({evidence.size}): the lens is finer than its knots, and phi, the slope at its axis, may be off by "
-            "more than its standard deviation",
-            "rays are about as wrong as those pixels; for phi by itself look at a lens that has a formula, too",
+            f"camera {name!r}: residuals vary with the radius, up to {evidence.most_px(own):.2f} px "
+            f"({evidence.size}): the spline has too few knots, and phi, the slope at its axis, may be off by more "
+            "than its standard deviation",
+            "rays are off by about as many pixels; to check phi, calibrate also with a lens that has a formula",
         )
     powers = _missing_powers(case, name)
     displaced = _growing(case.estimate.cameras[name], case.equations.pixel, powers)
@@ -42,9 +42,9 @@ def _of_radius(evidence: Evidence) -> Words:
     decreases = evidence.others.decreases(columns)
     power, decrease = powers[int(np.argmax(decreases))], float(np.max(decreases))
     share = 100.0 * min(1.0, decrease / evidence.others.freed(evidence.score.columns).decrease)
-    judged = "is too short" if evidence.noise_ratio >= SMALL else "is too short by little"
+    judged = "is too short" if evidence.noise_ratio >= SMALL else "is slightly too short"
     sentence = (
-        f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px ({evidence.size}): "
+        f"camera {name!r}: residuals vary with the radius, up to {evidence.most_px(own):.2f} px ({evidence.size}): "
         f"the radial polynomial {judged}; one more power, r^{power}, explains {share:.0f} % of it"
     )
     return Words(sentence, _longer(case, name, power))
@@ -58,9 +58,9 @@ def _longer(case: Case, camera: str, power: int) -> str:
     if lens.powers:
         return f"calibrate with --powers {','.join(map(str, sorted({*lens.powers, power})))}"
     if held:
-        return f"let {held[0]} free (no --fix {held[0]}=...)"
+        return f"solve for {held[0]} (no --fix {held[0]}=...)"
     if "rational" in lens.more_terms and "rational" not in lens.terms:
-        return "calibrate with --terms rational, which has more along the radius, or with another lens"
+        return "calibrate with --terms rational, which has more radial coefficients, or with another lens"
     growing = " or ".join(kind for kind, other in LENSES.items() if other.trial_powers)
     return f"the {lens.kind} lens has no such power: try another lens or the {growing} one with more powers"
 
@@ -119,7 +119,7 @@ def _of_decentring(evidence: Evidence) -> Words:
     if own and not set(own) <= set(lens.names):
         advice = f"calibrate with --terms tangential, which frees {' and '.join(own)}"
     elif own:
-        advice = f"let {' and '.join(own)} free"
+        advice = f"solve for {' and '.join(own)}"
     else:
         advice = f"calibrate with --lens {kind}, which has {' and '.join(names)}"
     away = f"a tangential displacement of up to {evidence.most_px():.2f} px"
@@ -154,7 +154,7 @@ def _of_prism(evidence: Evidence) -> Words:
     kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
     own = evidence.case.estimate.cameras[name].lens.kind == kind
     return evidence.words(
-        f"camera {name!r}: its picture is displaced one way towards its rim, as by a thin prism, by up to "
+        f"camera {name!r}: its picture is displaced in one direction, most at its edges, as by a thin prism, by up to "
         f"{evidence.most_px():.2f} px",
         f"calibrate with {'' if own else f'--lens {kind} '}--terms prism",
     )

@@ -101,7 +101,7 @@ def _of_point(evidence: Evidence) -> Words:
     name = evidence.score.subject
     mm, sd = evidence.in_mm
     return evidence.words(
-        f"{name} lies x {with_sd(mm[0], sd[0], '+')}, y {with_sd(mm[1], sd[1], '+')} mm from where it is drawn",
+        f"{name} lies x {with_sd(mm[0], sd[0], '+')}, y {with_sd(mm[1], sd[1], '+')} mm from its nominal position",
         f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
         "xy",
         "mm",
@@ -131,7 +131,7 @@ def _of_length(evidence: Evidence) -> Words:
     drawn_m = evidence.case.problem.observations.targets[target].dimensions[dimension]
     by, sd = evidence.score.amount, evidence.score.sd
     sentence = f"{name} is {with_sd(drawn_m + by[0], sd[0])} m, not {drawn_m:g} m as the target says"
-    advice = f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}"
+    advice = f"measure it and correct the target, or solve for it: --estimate {target}.{dimension}"
     return evidence.words(sentence, advice, (dimension,), "mm")
 
 
@@ -196,7 +196,7 @@ def _sheared(case: Case) -> Iterator[EffectColumns]:
 
 def _of_shear(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    lie = f"lie {with_sd(mm[0], sd[0], '+')} mm along themselves"
+    lie = f"are shifted by {with_sd(mm[0], sd[0], '+')} mm along themselves"
     advice = "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are"
     return evidence.words(f"{evidence.score.subject} is out of square: its edges {lie}", advice, ("shear",), "mm")
 
@@ -228,9 +228,9 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
 
 def _of_place(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    high = f"{with_sd(abs(mm[0]), sd[0])} mm {'higher' if mm[0] > 0.0 else 'lower'} than around it"
+    high = f"{with_sd(abs(mm[0]), sd[0])} mm {'higher' if mm[0] > 0.0 else 'lower'} than around this place"
     advice = "look for what lies under the carpet, and leave out what was observed there"
-    return evidence.words(f"{evidence.score.subject} the floor is {high}", advice, ["height"], "mm")
+    return evidence.words(f"{evidence.score.subject}: the floor is {high}", advice, ["height"], "mm")
 
 
 def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:

@@ -214,8 +214,8 @@ class Spline(Planar):
         plain = Spline(self.values[: len(_names(self.powers))], self.powers)
         with_it, without = (lens.mapped(grid_places(x, y))[:, 0] for lens in (self, plain))
         size_px = self.rim_px * rms(np.linalg.norm(with_it - without, axis=0))
-        size = f"{two_digits(size_px)} px besides (rms over the picture)"
-        return f"{said}; a surface of {len(NODES) // 2} nodes displaces by {size}"
+        size = f"{two_digits(size_px)} px (rms over the picture)"
+        return f"{said}; a surface of {len(NODES) // 2} nodes adds {size}"
 
     @property
     def nodes(self) -> frozenset[str]:

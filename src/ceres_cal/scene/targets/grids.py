@@ -118,7 +118,7 @@ def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) ->
 CIRCLE_GRID = TargetKind(
     "circle-grid",
     "the centres of a grid of circles",
-    "columns and rows (circles), spacing_m, diameter_m, asymmetric (every other row half a step aside, OpenCV's)",
+    "columns and rows (circles), spacing_m, diameter_m, asymmetric (every other row shifted by half a step, OpenCV's)",
     'points "c,r" at (c, r, 0) spacings, or (2 c + r mod 2, r, 0) of an asymmetric grid',
     lambda: {"circle-grid": circle_grid(4, 11, 0.02, 0.016, asymmetric=True)},
     from_arguments("circle-grid", circle_grid),

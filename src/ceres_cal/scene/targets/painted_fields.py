@@ -214,7 +214,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
     def as_kind(self) -> TargetKind:
         """Return its entry in the table of kinds."""
         dimensions = ", ".join(self.dimensions)
-        given = f"{dimensions}, each in place of the rules'"
+        given = f"{dimensions}, each replacing that of the rules"
         if self.variants is not None:
             key = self.variants.key
             given = (
@@ -222,7 +222,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             )
         if self.parts:
             given += f"; true or false: {', '.join(self.parts)}"
-        given += f"; {TOLERANCE}: by how much lines may lie aside, else as is usual of its size"
+        given += f"; {TOLERANCE}: how far lines may be off; default: usual for the field's size"
         what = f"{self.what}: x along its length, the middle at 0, 0; measured {self.measured}"
         return TargetKind(self.kind, what, given, self.features, self.examples, self.from_spec)
 

@@ -135,7 +135,7 @@ class Target(Frozen):
         require_places(self.kind, self.points, self.curves)
         if self.movable and self.reach_m > HANDY_M:  # only boards fit in any unit
             raise InputError(
-                f"{self.kind}: it reaches {self.reach_m:.0f} m from its origin, and nobody holds that before a camera: "
+                f"{self.kind}: it reaches {self.reach_m:.0f} m from its origin, too far for a board that is held up: "
                 "give its dimensions in metres, or with their unit, such as 25mm"
             )
 
