@@ -97,8 +97,8 @@ def to_best(known: Information, says: ReducedInformation) -> Array:
 
     The estimate weighs observations against priors as if errors were independent. Let A be the observations'
     information by the model, P the priors' information and g their pull. The observations alone have their minimum at
-    A^-1 g from the estimate. With their final information A', the minimum of everything is at (A' + P)^-1 (A' A^-1 - 1)
-    g.
+    A^-1 g from the estimate. With their final information A' the minimum of everything is at
+    (A' + P)^-1 (A' A^-1 - 1) g.
     """
     priors = says.priors.less(says.built)
     alone, wider = says.shared.less(priors), known.less(priors)

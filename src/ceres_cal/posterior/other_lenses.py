@@ -157,9 +157,9 @@ def shown_slopes(there: Estimate, keys: Sequence[Key], lenses: OtherLenses) -> S
 
 
 def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate) -> OtherLenses:
-    """Combine those of several cameras, each with its own probabilities, into about as many combinations as there are
-    lenses: for each camera the others and then the chosen one divide the interval from 0 to 1 by their probabilities,
-    and lenses that share a part of the interval are a combination.
+    """Combine other lenses of several cameras, each with its probabilities, into about as many combinations as there
+    are lenses: for each camera the others and then the chosen one divide the interval from 0 to 1 by their
+    probabilities, and lenses that share a part of the interval are a combination.
 
     Args:
         floors: stations that see the floor. end: poses of the others, which one camera does not determine.

@@ -92,8 +92,8 @@ class Posterior(Frozen):
         """Return the posterior with alternatives: shifts (S, K) of some numbers, with the probability of each.
 
         Where these follow other lenses, `lenses` are the estimate with the chosen one and those with each of them.
-        Alternatives become components of the mixtures, each a copy of all others, and enter the information by their
-        second moments.
+        Alternatives become components of the mixtures, each a shifted copy of all components, and enter the information
+        by their second moments.
         """
         if not len(shifts):
             return self
