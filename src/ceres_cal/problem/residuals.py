@@ -301,14 +301,20 @@ def write_equations(sights: Sights, estimate: Estimate, there: Residuals) -> Equ
         SolutionError: there is none.
     """
     x, y = there.points.T
-    sights = sights.used(np.isfinite(x + y), np.isfinite(there.curves))
-    if not len(sights):
-        raise SolutionError("the calibration cannot project any of the observations: give those that it was made from")
-    return equations_of(sights, estimate, there)
+    return equations_of(sights.used(np.isfinite(x + y), np.isfinite(there.curves)), estimate, there)
 
 
 def equations_of(sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
-    """The equations of some sights, all of whose residuals are finite."""
+    """The equations of some sights, all of whose residuals are finite.
+
+    An observation without derivatives has no equation: near a fold of the lens the search for the foot may not
+    converge, and leaves the image when it continues from where the residuals stopped.
+
+    Raises:
+        SolutionError: there is none.
+    """
+    if not len(sights):
+        raise SolutionError("the calibration cannot project any of the observations: give those that it was made from")
     poses = estimate.pose_stack(sights.keys)
     parts = []
     for numbers in map(sights.numbers, sights.cameras):
@@ -322,11 +328,15 @@ def equations_of(sights: Sights, estimate: Estimate, there: Residuals) -> Equati
         if missing := size - part["intrinsics"].shape[1]:
             part["intrinsics"] = np.pad(part["intrinsics"], ((0, 0), (0, missing)))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts[1:] else parts[0]
+    points, curves = sights.observations.points, sights.observations.curves
+    if np.any(lost := ~np.isfinite(columns["pose"][:, 0])):
+        kept = np.ones(len(points) + len(curves), dtype=bool)
+        kept[columns["observation"][lost]] = False
+        return equations_of(sights.used(kept[: len(points)], kept[len(points) :]), estimate, there)
     if np.any(np.diff(columns["sight"]) < 0):
         order = np.argsort(columns["sight"], kind="stable")
         columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
-    points, curves = sights.observations.points, sights.observations.curves
     columns["is_curve"] = columns["observation"] >= len(points)
     view = of_observations(columns["observation"], points.view, curves.view)
     return Equations(sights=sights, poses=poses, bounds=bounds, view=view.astype(np.int64), **columns)
