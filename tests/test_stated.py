@@ -145,6 +145,17 @@ def test_a_steep_valley_has_few_components(far_up: float) -> None:
     assert valley.sd[0] == pytest.approx(30.0 / far_up, rel=0.01)
 
 
+def test_nodes_beyond_all_quantiles_are_not_extrapolated() -> None:
+    """Two nodes beyond eight standard deviations whose cost is almost equal: variances of -2 between them."""
+    steps = np.column_stack([np.linspace(-300.0, 300.0, 13), np.zeros((13, 4))])
+    across = [Information(KEYS[1:], np.eye(4) * (1.0 + number)) for number in range(13)]
+    roots = np.concatenate([[-8.401, -8.404, -8.2, -7.0, -4.0], np.linspace(-1.0, 1.0, 5), [4.0, 9.001, 9.0]])
+    valley = Mixture.along_phi(KEYS, 800.0, steps, roots**2, across, (False, False))
+    variances = valley.refined(valley.steps, valley.variances)[2]
+    assert np.min(variances[:, 1:]) >= 1.0 / 13.0 * (1.0 - 1e-9)
+    assert np.all(np.isfinite(valley.sd))
+
+
 def test_files_of_before_are_read() -> None:
     """Their valley, and one end of each weak direction, are the mixtures that they would be today."""
     steps = np.column_stack([np.linspace(-30.0, 30.0, 13), np.zeros((13, 4))])

@@ -240,9 +240,7 @@ class Mixture(Frozen):
                 yield share * weights[[end]], self._limit(chain, own, sds, end)[None], widths[[end]]
 
     def _between(self, chain: Chain) -> tuple[Array, Array, Array]:
-        """Return weights (F,) of places along the valley, its ends first and last; the shares (F, N) of nodes in each;
-        and the differences (F, N) of these shares to the next place.
-        """
+        """Return weights (F,) of places along the valley, ends included; shares (F, N) of nodes, and steps of these."""
         fine = 0.25  # standard deviations from one interpolated place to the next; nothing changes from half to double
         roots, log_phi = chain.roots, np.log(self.phi[chain.at])
         near, each = np.clip(roots, -_REACH, _REACH), np.eye(len(roots))  # farther up weights are negligible
@@ -250,7 +248,8 @@ class Mixture(Frozen):
         counts = np.maximum(np.ceil(np.abs(np.diff(near)) / fine), 2).astype(int)
         share = (1.0 + np.diff(beyond) / whole) / counts
         node = np.repeat(np.arange(len(counts)), counts)
-        part = (beyond[:-1] / whole)[node] + share[node] * np.concatenate([np.arange(n) + 0.5 for n in counts])
+        done = np.concatenate([np.arange(n) + 0.5 for n in counts])
+        part = np.clip((beyond[:-1] / whole)[node] + share[node] * done, 0.0, 1.0)  # also where both nodes are too far
         places = np.zeros((len(node), len(roots)))
         places[np.arange(len(node)), node], places[np.arange(len(node)), node + 1] = 1.0 - part, part
         long = (1.0 - _FLAT) * np.abs(np.diff(roots)) + _FLAT * np.abs(np.diff(log_phi))
