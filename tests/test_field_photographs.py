@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,16 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
-from ceres_cal.detect.photographs import Auto, Clicks, Facing, FieldDetections, FieldOptions, detect_field, load_clicks
+from ceres_cal.detect.photographs import (
+    Auto,
+    Clicks,
+    Facing,
+    FieldDetections,
+    FieldOptions,
+    detect_field,
+    field,
+    load_clicks,
+)
 from ceres_cal.detect.photographs.by_hand import FORMAT, clicks_from_json, starts_from_clicks
 from ceres_cal.detect.photographs.field import _signs
 from ceres_cal.detect.photographs.follow import follow
@@ -293,6 +303,22 @@ def test_a_miss_among_hits_is_listed(tmp_path: Path, shot: script.Shot) -> None:
     assert list(found.found) == [str(paths[0]), str(paths[2])]
     assert [path for path, _ in found.missed] == [str(paths[1])]
     assert [view.frame for view in found.observations.views] == ["1", "3"]
+
+
+def test_a_picture_whose_search_fails_numerically_is_a_miss(
+    tmp_path: Path, shot: script.Shot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths, search, count = [saved(shot, tmp_path, f"{name}.png") for name in "ab"], field._looked_for, iter(range(9))
+
+    def second_fails(*arguments: Any) -> Any:
+        if next(count) == 1:
+            raise np.linalg.LinAlgError("Eigenvalues did not converge")
+        return search(*arguments)
+
+    monkeypatch.setattr(field, "_looked_for", second_fails)
+    found = detect_field(paths, FIELD, shot.camera)
+    assert [path for path, _ in found.missed] == [str(paths[1])]
+    assert "the search failed numerically (Eigenvalues did not converge)" in dict(found.missed)[str(paths[1])]
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
-from ceres_cal.base import Array32, Frozen, Mask, brief, distinct, for_small_matrices, frame_of, median, replace
+from ceres_cal.base import (
+    Array32,
+    Frozen,
+    Mask,
+    brief,
+    distinct,
+    for_small_matrices,
+    frame_of,
+    median,
+    numerical,
+    replace,
+)
 from ceres_cal.base.errors import (
     CalibrationError,
     ImageProgress,
     InputError,
     NothingShownError,
+    SolutionError,
     attempt,
     naming,
     or_none,
@@ -134,7 +146,10 @@ def detect_field(
     def looked_for(path: Path, grey: Array32, starts: Sequence[Start | SearchResult]) -> SearchResult:
         with naming(path):
             try:
-                return _looked_for(_without(grey, options.left_out), drawn, painted, starts, options)
+                with numerical("the search"):
+                    return _looked_for(_without(grey, options.left_out), drawn, painted, starts, options)
+            except SolutionError as error:  # reads: "no field in any of ... images; ...", or which were missed
+                return SearchResult(None, str(error))
             except SeveralWaysError as error:
                 refused(path, SearchResult(None, str(error), seen=error.seen))
                 if path.is_file() and (turned := turned_words(path)):
