@@ -65,7 +65,7 @@ def test_sights_are_stations_and_frames() -> None:
         SightKey("left", "moved", None),
         SightKey("right", "right", "far"),
     )
-    assert sights.views == (tuple(range(4)), (6,), (7,), (8,), (9,))
+    assert sights.views == (tuple(range(6)), (6,), (7,), (8,), (9,))
     assert [str(key) for key in sights.keys[:2]] == ["station 'left'", "station 'right', placement 'near'"]
 
 
