@@ -163,7 +163,8 @@ def test_views_of_any_kind(view: str) -> None:
 
 def test_without_a_word_on_which_way_round(shot: script.Shot) -> None:
     with pytest.raises(
-        InputError, match=r"in 2 ways: LeftGoalLine lies towards the (top|bottom) or the (top|bottom) of"
+        InputError,
+        match=r"2 orientations look the same: LeftGoalLine lies towards the (top|bottom) or the (top|bottom) of",
     ):
         search(shot.grey, FIELD, NAMES, Auto())
     with pytest.raises(InputError, match="there is no line or point 'Nowhere'"):
@@ -179,7 +180,9 @@ def test_a_quarter_turn_that_looks_alike_too() -> None:
     scene = taken_as(field_scene(FIELD, {"overhead": optics}, stations), script.varied(0))
     picture = photograph(scene, "overhead", "0001", seed=3)
     near = script.Shot(scene, scene.camera_at("overhead"), FIELD, picture, True)
-    with pytest.raises(InputError, match="alike in 4 ways"):  # only two of them by what the strokes tell alone
+    with pytest.raises(
+        InputError, match="4 orientations look the same"
+    ):  # only two of them by what the strokes tell alone
         search(near.grey, FIELD, NAMES, Auto())
 
 
@@ -269,7 +272,7 @@ def test_from_photographs_alone_to_a_calibration(
     capsys.readouterr()
     assert np.mean(script.floor_error_mm(shot, Calibration.load(calibration).station())) < 1.0  # 0.2 mm
     assert main([*detect, "--start", calibration]) == 0
-    assert "in one of the 2 ways it can be seen: the calibration of before says which" in capsys.readouterr().out
+    assert "in one of 2 possible orientations, chosen by the earlier calibration" in capsys.readouterr().out
     assert len(Observations.load(out).curves) > 250  # 292
     corners = tmp_path / "corners.json"
     corners.write_text(json.dumps({"format": "ceres-cal/corners", "version": 1, "points": {}}))

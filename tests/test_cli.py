@@ -785,9 +785,9 @@ def test_beyond_the_lens(say: Say, calibrated: Path, tmp_path: Path) -> None:
     data["cameras"]["overhead"]["lens"]["coefficients"] = folding
     (tmp_path / "weak.json").write_text(json.dumps(data))
     said = say("locate", tmp_path / "weak.json", "2000,480")
-    assert said.code == 1 and "past the 1000 px from the principal point" in said.out
+    assert said.code == 1 and "more than 1000 px from the principal point" in said.out
     said = say("project", tmp_path / "weak.json", "-30,0")
-    assert said.code == 1 and "outside of what the lens can show" in said.out
+    assert said.code == 1 and "outside the field of view of the lens" in said.out
 
 
 def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

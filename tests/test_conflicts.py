@@ -122,7 +122,7 @@ def test_what_holds_without_a_wrong_statement_is_shown_beside_the_bounds_with_it
     assert free.undisputed is free
     text = Document(tuple(calibration_sections(quality_of(wrong(), seen()), ["seen.json"]))).text()
     assert re.search(r"height +3\.97\d? m +5\d\smm +2\.\d+ to 4\.\d+ m", text)
-    assert "± sd of the position: without what is contradicted" in text
+    assert "± sd of the position: without the contradicted statements" in text
 
 
 def test_files_keep_conflicts(tmp_path: Path) -> None:

@@ -250,7 +250,7 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
     drawn = cv2.imread(str(tmp_path / "refused.png"))
     assert drawn is not None and drawn.shape == picture().shape and np.any(drawn != picture())
     assert main([*asked, "--estimate", "mark"]) == 2
-    assert "no painted line lies elsewhere with another goal_center_to_penalty_mark_m" in capsys.readouterr().err
+    assert "no painted line depends on goal_center_to_penalty_mark_m" in capsys.readouterr().err
     assert main([*asked, "--estimate", "length,width"]) == 0
     assert "lengths, roughly, for `calibrate` to solve for: field_length_m 8.2" in capsys.readouterr().out
     priors = json.loads(Path(observed).read_text())["priors"]

@@ -97,14 +97,14 @@ def test_lines_that_are_bent_as_by_no_lens_are_another_field_s() -> None:
         lines = Lines(course, every, wave, np.full(len(course), 0.1), 0.8, 1.0)
         built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA, None).priors)
         assert built.is_other == is_other and built.wander_m == pytest.approx(wander_m, rel=0.2)
-        assert is_other == any("bent as by no lens" in words for words in built.words())
+        assert is_other == any("bent, which no lens explains" in words for words in built.words())
 
 
 def test_two_sides_tell_a_mirrored_picture() -> None:
     ways = [CAMERA, CAMERA.at(CAMERA.cam_from_world @ Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)))]
     for sides, said in (
-        (("left", "bottom"), "in a mirrored picture only"),
-        (("top", "left"), "not with Left"),
+        (("left", "bottom"), "only if the picture is mirrored"),
+        (("top", "left"), "contradicts the photograph"),
     ):
         facing = [Facing(name, side) for name, side in zip(("LeftGoalLine", "TopTouchLine"), sides, strict=True)]
         assert said in _contradiction(ways, facing, FIELD, FIELD.curve_names)

@@ -348,7 +348,7 @@ def test_pictures_that_show_too_little_are_taken_together(tmp_path: Path, shot: 
     with pytest.raises(InputError, match="no field in any of 1 images"):
         detect_field(paths[:1], FIELD, shot.camera, options=options)
     found = detect_field(paths, FIELD, shot.camera, options=options)
-    assert list(found.found) == [f"{paths[0]} and 2 more, together"]
+    assert list(found.found) == [f"{paths[0]} and 2 more, combined"]
     assert [view.frame for view in found.observations.views] == ["0"]
 
 
@@ -397,7 +397,7 @@ def test_clicks_that_cannot_be(tmp_path: Path, shot: script.Shot) -> None:
         detect_field([path], FIELD, Clicks({**good, "Nowhere": (1.0, 2.0)}))
     first, second, third, fourth = good
     mirrored = {first: good[second], second: good[first], third: good[fourth], fourth: good[third]}
-    with pytest.raises(InputError, match="as if seen from below"):
+    with pytest.raises(InputError, match="the points nor the picture are mirrored"):
         detect_field([path], FIELD, Clicks(mirrored))
     row = ("LeftPenaltyMark", "CenterMark", "RightPenaltyMark", "LeftGoalCenterCrossing")
     in_a_row = {name: (100.0 * i, 50.0 * i) for i, name in enumerate(row)}

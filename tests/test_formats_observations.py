@@ -39,7 +39,7 @@ def test_the_command_takes_the_formats_options(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / "corners.vnl").write_text(CORNERS)
     ask = ["import", str(tmp_path / "corners.vnl"), "-o", str(tmp_path / "o.json"), "--columns", "3", "--rows", "2"]
     assert main(ask) == 2
-    assert "the board is not said in the file" in capsys.readouterr().err
+    assert "the file does not describe the board" in capsys.readouterr().err
     assert main([*ask, "--square", "0.1", "--image-size", "640x480"]) == 0
     assert "5 points and 0 curve observations in 1 view\n" in capsys.readouterr().out
     assert len(Observations.load(tmp_path / "o.json").points) == 5

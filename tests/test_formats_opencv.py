@@ -81,7 +81,7 @@ def test_a_stereo_file_of_opencv_alone_stands_at_its_first_camera(tmp_path: Path
 def test_what_opencvs_inverse_misses_is_said(tmp_path: Path) -> None:
     camera = with_lens("brown")
     (warning,) = export(over_field(camera), "opencv", tmp_path / "a.yml").warnings
-    assert "cv2.undistortPoints stops after five rounds, here up to" in warning and "give it criteria=" in warning
+    assert "cv2.undistortPoints stops after five rounds, here up to" in warning and "call it with criteria=" in warning
     matrix, distortion, _, _ = camera.to_opencv()
     pixels = places(camera)[1]
     end = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
@@ -216,7 +216,7 @@ def test_too_many_stations_are_refused(tmp_path: Path) -> None:
     mixed = two_cameras("brown")
     with pytest.raises(InputError, match="there is no station 'x'"):
         export(mixed, "opencv", tmp_path / "a.yml", ["x"])
-    with pytest.raises(InputError, match=r"wrong by .* mm on the field, more than 0.001"):
+    with pytest.raises(InputError, match=r"off by .* mm on the field, more than 0.001"):
         export(over_field(with_lens("radial-2-3")), "opencv", tmp_path / "a.yml", max_loss_mm=1e-3)
     assert not (tmp_path / "a.yml").exists()
 

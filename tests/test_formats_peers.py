@@ -181,8 +181,8 @@ def test_a_camera_that_sees_behind_itself_in_a_model_of_tangents(tmp_path: Path)
     camera = replace(with_lens(KannalaBrandt((0.0,) * 4)), phi=437.0)  # corners 107 degrees off the axis
     (loss,) = export(over_field(camera), "mrcal", tmp_path / "a.cameramodel").losses
     assert max(worst for _, worst in loss.field_mm.values()) < 3.0
-    assert "overhead: some of it is not shown at all, over the image" in (tmp_path / "a.cameramodel").read_text()
-    with pytest.raises(InputError, match="station 'overhead': the camera sees so wide that nothing in this format"):
+    assert "overhead: part of the image cannot be shown, over the image" in (tmp_path / "a.cameramodel").read_text()
+    with pytest.raises(InputError, match="station 'overhead': the field of view is too wide for this format"):
         camera_loss(
             "overhead",
             camera,
@@ -293,7 +293,7 @@ def test_kalibrs_other_models_come_as_the_nearest_lens(model: str, own: list[flo
     entry = {"camera_model": model, "intrinsics": [*own, 600.0, 601.0, 640.0, 480.0], "resolution": [1280, 960]}
     (tmp_path / "a.yaml").write_text(yaml.safe_dump({"cam0": entry}))
     (held, *_) = import_calibration(tmp_path / "a.yaml").warnings
-    assert f"its {model}-none model is held as the nearest" in held
+    assert f"its {model}-none model is approximated by the nearest" in held
     assert float(held.split("off by ")[1].split(" px")[0]) < 0.2
     assert set(LENSES) >= set(EXACT)
 
@@ -303,7 +303,7 @@ def test_kalibrs_other_models_come_as_the_nearest_lens(model: str, own: list[flo
     [
         ("image_width: 9\nimage_width: 8\n", "'image_width' is given twice"),
         ("a: &a {b: 1}\nc: {<<: *a}\n", "'<<' is given twice or merged"),
-        ("a: &a [*a]\n", "holds itself"),
+        ("a: &a [*a]\n", "a reference to itself"),
         ("a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40)), "would take"),
         ("[" * 5000, "not valid YAML"),
         ("a: 2026-99-99\n", "not valid YAML"),

@@ -144,14 +144,14 @@ def test_what_loses_less_is_named(tmp_path: Path) -> None:
     """A lens that one coefficient does not hold: OpenCV's model does."""
     exported = export(over_field(with_lens(KannalaBrandt((-0.03, 0.002, 0.0, 0.0)))), "ssl-vision", tmp_path / "a.pb")
     worst = max(worst for _, worst in exported.losses[0].field_mm.values())
-    (said,) = [text for text in exported.warnings if "one coefficient does not hold this lens" in text]
-    assert worst > 10.0 and f"{worst:.3g} mm are lost at most" in said and "--to opencv (0 mm at most)" in said
+    (said,) = [text for text in exported.warnings if "one coefficient cannot describe this lens" in text]
+    assert worst > 10.0 and f"{worst:.3g} mm)" in said and "--to opencv (0 mm at most)" in said
 
 
 def test_a_negative_distortion_is_said_out_loud(tmp_path: Path) -> None:
     bent = with_lens(SSL_LENS.with_values([-1e-7]))
     (warning,) = export(over_field(bent), "ssl-vision", tmp_path / "a.pb").warnings
-    assert "station 'overhead': its distortion is negative: ssl-vision locates with it but draws" in warning
+    assert "station 'overhead': its distortion is negative: ssl-vision uses it to locate, but not to draw" in warning
     assert any("negative" in text for text in import_calibration(tmp_path / "a.pb").warnings)
 
 
@@ -280,7 +280,7 @@ def test_what_ssl_vision_would_clamp_is_refused(tmp_path: Path) -> None:
     high = with_lens("radial-3").at(
         with_lens("radial-3").cam_from_world.__class__.looking((0, 0, 7.0), np.diag([1, -1, -1]))
     )
-    with pytest.raises(InputError, match="tz 7000 mm is not between 0 and 6500, to which ssl-vision clamps"):
+    with pytest.raises(InputError, match="tz 7000 mm is not between 0 and 6500, the range of ssl-vision"):
         export(over_field(high, "camera0"), "ssl-vision-xml", path)
     with pytest.raises(InputError, match="it has no camera 7, only 0, 1"):
         export(over_field(with_lens("radial-3"), "camera7"), "ssl-vision-xml", path)
@@ -391,7 +391,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "geometry.yml"
     ask = ["export", str(tmp_path / "c.json"), "--to", "vision-processor", "-o", str(path)]
     assert main([*ask, "--max-loss-mm", "1"]) == 2
-    assert "the format would be wrong by" in capsys.readouterr().err and not path.exists()
+    assert "the export would be off by" in capsys.readouterr().err and not path.exists()
     assert main([*ask, "--camera-id", "1"]) == 0
     assert "mm at most, at 150 mm" in capsys.readouterr().out
     assert main(["import", str(path), "-o", str(tmp_path / "back.json")]) == 0
@@ -414,7 +414,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ("a.xml", b"<html></html>", "not a settings file of ssl-vision: it begins with <html>"),
         ("a.xml", b'<Var name="x">1</Var>', "not a settings file of ssl-vision: it begins with <Var>"),
         ("a.xml", b"<VarXML></VarXML>", "keeps its cameras in robocup-ssl.xml"),
-        ("a.txt", b"hello", "of no format that is known"),
+        ("a.txt", b"hello", "its format is not recognised"),
     ],
 )
 def test_broken_files_are_one_line(name: str, content: bytes, words: str, tmp_path: Path) -> None:
@@ -428,7 +428,7 @@ def test_broken_files_are_one_line(name: str, content: bytes, words: str, tmp_pa
 def test_a_calibration_without_a_field_asks_for_one(tmp_path: Path) -> None:
     bare = over_field(with_lens("brown"))
     alone = Calibration(**{**vars(bare), "targets": {}})
-    with pytest.raises(InputError, match="the message needs a field, and the calibration has none"):
+    with pytest.raises(InputError, match="the message needs a field, but the calibration has none"):
         export(alone, "ssl-vision", tmp_path / "a.pb")
     export(over_field(with_lens("radial-3")), "ssl-vision", tmp_path / "a.pb")
     export(alone, "ssl-vision", tmp_path / "a.pb")  # into a file that has one

@@ -104,7 +104,7 @@ def test_everything_known_is_found_and_what_shows_nothing_is_named(calibration: 
         ("0003", "field", None),
         ("board_08", "board", "board_08"),
     }
-    with pytest.raises(NothingShownError, match=r"in any of 3 photographs, within .*dark\.png"):
+    with pytest.raises(NothingShownError, match=r"in any of 3 photographs within .*dark\.png"):
         replace(found, observations=None).require()
     assert [step[:2] for step in steps] == [(i, 6) for i in range(1, 7)]
 
@@ -143,7 +143,7 @@ def test_wrong_input_is_refused_in_one_line(say: Say, folder: Path) -> None:
     detect_known(Calibration.load(old), [NEW], boards=False).require().save(folder / "seen.json")
     assert Observations.load(folder / "seen.json").views[0].frame == "0003"
     for arguments, message in (
-        (("check", old, NEW, folder / "seen.json"), "observations beside photographs"),
+        (("check", old, NEW, folder / "seen.json"), "observations cannot be mixed with photographs"),
         (("check", old, NEW, NEW), "given twice"),
         (("check", old, folder / "gone.jpg"), "no such file"),
         (("check", old, NEW, "--station", "left"), "there is no station 'left'"),

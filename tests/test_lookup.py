@@ -46,7 +46,7 @@ def test_a_smaller_error_takes_a_finer_grid() -> None:
     steps = [make_lookup_table(CAMERA.at(HOME), "overhead", X_M, Y_M, error).step_px for error in (20.0, 2.0, 0.2)]
     assert steps == sorted(steps, reverse=True) and len(set(steps)) == 3
     small = replace(CAMERA, image_size=(64, 48), principal_point=(31.5, 23.5), phi=40.0, lens=Radial((0.0, 0.0)))
-    with pytest.raises(InputError, match="allow for more"):
+    with pytest.raises(InputError, match="allow a larger error"):
         make_lookup_table(small.at(HOME), "overhead", X_M, Y_M, 1e-7)
     with pytest.raises(InputError, match="step_px"):
         make_lookup_table(CAMERA.at(HOME), "overhead", X_M, Y_M, step_px=0)

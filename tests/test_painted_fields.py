@@ -189,7 +189,7 @@ def test_a_photograph_of_another_league(tmp_path: Path, capsys: pytest.CaptureFi
     cv2.imwrite(path, shot.picture.image)
     command = ["detect", "field", path, "--target", "vss-3", "--auto", "--points", "-o", out, "--picture", refused]
     assert main(command) == 2
-    assert "it looks alike in 2 ways: LeftGoalLine lies towards" in capsys.readouterr().err
+    assert "2 orientations look the same: LeftGoalLine lies towards" in capsys.readouterr().err
     assert cv2.imread(refused) is not None
     assert main([*command, "--facing", f"LeftGoalLine={_towards(shot.camera)}"]) == 0
     observations = Observations.load(out)

@@ -66,7 +66,7 @@ WRONG = {
         ("VIDEO --auto --target ssl-b --keep-start", "--keep-start needs --start or --corner"),
         ("VIDEO --auto --target ssl-b --estimate lenght", "'lenght' is no dimension"),
         ("VIDEO --auto --target ssl-b --estimate length=9000", "is it in mm? Give metres"),
-        ("VIDEO --auto --target ssl-b --estimate goal_width", "no painted line lies elsewhere"),
+        ("VIDEO --auto --target ssl-b --estimate goal_width", "no painted line depends on"),
         ("VIDEO --auto --target ssl-b --not-painted Halfway", "did you mean 'HalfwayLine'?"),
         ("VIDEO --auto --target ssl-b --mask nowhere.png", "nowhere.png: no such file"),
         ("VIDEO --auto --target ssl-b --picture nowhere/seen.png", "there is no folder 'nowhere'"),

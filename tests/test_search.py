@@ -102,7 +102,7 @@ def test_seen_alike_from_two_places() -> None:
     assert places is not None and "(2.80, 0.50, 4.00)" in places.groups()
     assert calibration.ambiguities == (warning,)
     judged = judge_quality(quality_of(calibration, three))
-    assert judged.level == "no" and "is seen alike from another place" in judged.headline
+    assert judged.level == "no" and "fit equally well from another position" in judged.headline
     assert off_in_sd(calibration) < 1.0  # 0.7
     assert off_in_sd(calibrate(replace(three, priors=(HEIGHT,)), KNOWN)) < 3.0  # 0.4
 
@@ -112,7 +112,7 @@ def test_few_boards_tell_nothing_of_a_place_in_the_world() -> None:
     few = observed(Board(views=3, columns=6), 0)[1]
     calibration = calibrate(few)
     assert calibration.ambiguities == ()
-    assert "seen alike" not in judge_quality(quality_of(calibration, few)).headline
+    assert "fit equally well" not in judge_quality(quality_of(calibration, few)).headline
 
 
 def test_what_is_open_is_named() -> None:

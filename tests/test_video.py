@@ -71,7 +71,7 @@ def test_what_moves_is_gone_and_what_is_blurred_or_bumped_is_left_out() -> None:
 def test_a_camera_that_was_bumped_half_way_and_one_that_is_carried() -> None:
     bumped = merged((str(n), shot(n, 0.0 if n < 4 else 2.0)) for n in range(9))
     assert bumped.used == tuple(map(str, range(4, 9)))
-    with pytest.raises(InputError, match="no two of 5 pictures show the same"):
+    with pytest.raises(InputError, match="no two of 5 pictures agree"):
         merged((str(n), shot(n, 3.0 * n)) for n in range(5))
     assert merged([("alone", shot(1))]).used == ("alone",)
 

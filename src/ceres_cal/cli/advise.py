@@ -27,7 +27,7 @@ def _run(
     height_mm: float = arguments.height_option("height of what is to be located; default: 150, a robot's top", 150.0),
     station: str | None = arguments.station_option("whose map; may be left out where there is only one"),
     good_enough_mm: float | None = option(
-        "the worst error that will do; nothing is advised where it is reached", "MM", read=arguments.length("mm")
+        "largest acceptable error; no advice is given if the calibration reaches it", "MM", read=arguments.length("mm")
     ),
     board: tuple[int, int, float] | None = arguments.board_option(
         "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
@@ -81,7 +81,7 @@ def _verdict(advice: diagnostics.Advice) -> Iterator[str]:
             yield f"nothing needs to be measured: {worst} is {_mm(before.worst_mm)}, and {enough:g} mm are good enough"
         else:
             left = _mm(advice.promises[0].after.worst_mm)
-            yield f"none of this is worth the work: {worst} is {_mm(before.worst_mm)}, and {left} at best afterwards"
+            yield f"no measurement is worthwhile: {worst} is {_mm(before.worst_mm)}, and {left} at best afterwards"
         return
     fall = f"{_mm(before.worst_mm).removesuffix(' mm')} to {_mm(best.after.worst_mm)}"
     yield f"{best.measurement.words}: {worst} falls from {fall}{_range(best)}"
@@ -97,9 +97,9 @@ def _verdict(advice: diagnostics.Advice) -> Iterator[str]:
 def _range(promise: diagnostics.Promise) -> str:
     """Words on the range of a promise that depends on phi; "" where it hardly does."""
     if promise.rough:
-        return " (roughly: phi stays open)"
+        return " (roughly: phi is not determined)"
     low, high = promise.worst_range_mm
-    return f" ({_mm(low)} to {_mm(high)} over what phi may be)" if high > 1.1 * low else ""
+    return f" ({_mm(low)} to {_mm(high)} over the possible phi)" if high > 1.1 * low else ""
 
 
 def _mm(value: float) -> str:

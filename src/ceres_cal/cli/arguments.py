@@ -93,7 +93,7 @@ def timeout_option() -> Any:
 
 def frames_option() -> Any:
     """The option --frames N, for videos."""
-    what = "how many photographs to take out of a video, the sharpest of as many stretches"
+    what = "number of photographs to take from a video, the sharpest of as many parts"
     return option(what, "N", 30, read=whole(1))
 
 
@@ -101,7 +101,7 @@ class ReportArguments(QuietArguments):
     """Arguments of a command that may write its result, and a report."""
 
     output: Path | None
-    report: Path | None = option("file for a page (.html): may it be trusted, for what, to how many mm", "PAGE")
+    report: Path | None = option("write a report (.html): can it be trusted, for what, to how many mm", "PAGE")
     images: tuple[str, ...] = option(
         "with --report: a photograph, or a folder of them, named like the frames: the model is drawn into them",
         "PHOTOGRAPH",

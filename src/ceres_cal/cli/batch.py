@@ -46,7 +46,7 @@ def _run(
         "and unchanged inputs, are not done again",
         metavar="DIR",
     ),
-    options: str = option("arguments that every calibrate job gets besides", "'...'", ""),
+    options: str = option("additional arguments for every calibrate job", "'...'", ""),
     jobs: int = option("jobs at a time; default: 0, one a core", "N", 0, read=whole(0), elsewhere=("threads",)),
     reports: bool = switch("a report of each calibrate and refit, too", elsewhere=("report",)),
 ) -> Document:

@@ -28,8 +28,8 @@ class FieldArguments(QuietArguments):
         "IMAGE", "photographs that one camera took at one station, folders of them, or a video"
     )
     median: bool = switch(
-        "one picture of all of them (25 at most, evenly), as of a video always: robots and people, who are "
-        "elsewhere in each, are gone; what is blurred, or taken after the camera was moved, is left out and named"
+        "use the median of all of them (of 25 at most), as always with a video: it removes robots and people that "
+        "move; pictures that are blurred, or taken after the camera was moved, are left out and named"
     )
     target: str | None = option(
         "a field by its name (such as ssl-b, vss-3: `ceres-cal targets`), spelled out "
@@ -37,7 +37,7 @@ class FieldArguments(QuietArguments):
         "target named 'field'; default: that of the calibration to start from",
         "TARGET",
     )
-    start: Path | None = option("a calibration of before, or a file of corners (ceres-cal/corners)", "FILE")
+    start: Path | None = option("an earlier calibration, or a file of corners (ceres-cal/corners)", "FILE")
     corner: tuple[str, ...] = option(
         f"instead of --start: four points or more where they are seen, roughly, such as {_CORNER}",
         "NAME=X,Y",
@@ -47,10 +47,10 @@ class FieldArguments(QuietArguments):
         "without any start: find the field in the photograph; with --start CALIBRATION, however far it has moved"
     )
     keep_start: bool = switch(
-        "the start is good to 12 px: nothing farther off is looked at", beside=("start", "corner")
+        "the start is accurate to 12 px: nothing farther away is searched", beside=("start", "corner")
     )
     facing: tuple[str, ...] = option(
-        "with --auto: which way round a field is that looks alike turned, by the side of the picture (left, "
+        "with --auto: orientation of a field that looks the same turned: the side of the picture (left, "
         f"right, top, bottom, top-left, ...) that a line or point lies towards, such as {arguments.FACING_EXAMPLE}; it "
         "need not be in the picture",
         "NAME=SIDE",
@@ -63,7 +63,7 @@ class FieldArguments(QuietArguments):
     picture: Path | None = option("draw what was seen in the first photograph that is refused", "FILE")
     edges: bool = switch("both edges of each line instead of its middle")
     points: bool = switch(
-        "corners and crossings, too, for programs that take no lines: lines alone tell the camera better"
+        "detect corners and crossings, too, for programs that take no lines; lines alone are more accurate"
     )
     camera: str | None = arguments.camera_option(
         "name of the camera; default: that of the calibration, or camera", None
@@ -230,7 +230,7 @@ def _stretched(camera: scene.Camera) -> bool:
 def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:
     for one in images:
         yield (
-            f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "
+            f"{one['image']}: paint at {one['found']} of {one['places']} places, accurate to {one['sigma_px']:.3f} px; "
             f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"
         )
     for one in images:
@@ -240,15 +240,15 @@ def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:
         if "aspect" in one:
             yield (
                 f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: if the picture was "
-                "stretched, the original is better"
+                "stretched, use the original"
             )
     yield from (f"{one['image']}: {words}" for one in images for words in one["not_as_drawn"])
-    yield from (f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in images if one["lacking"])
+    yield from (f"{one['image']}: {', '.join(one['lacking'])} not found" for one in images if one["lacking"])
 
 
 def _ways(searched: dict[str, Any]) -> str:
     """Words on how many ways a photograph could be taken for the field, and what chose one."""
     if searched["settled_by"] is None:
-        return "in the one way it can be seen"
-    by = {"facing": "--facing", "before": "the calibration of before"}[searched["settled_by"]]
-    return f"in one of the {searched['ways']} ways it can be seen: {by} says which"
+        return "in the only possible orientation"
+    by = {"facing": "--facing", "before": "the earlier calibration"}[searched["settled_by"]]
+    return f"in one of {searched['ways']} possible orientations, chosen by {by}"

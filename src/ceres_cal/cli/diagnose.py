@@ -23,9 +23,9 @@ def _run(
     observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order"),
     output: Path | None = arguments.output_option("the residual of every observation (.csv, .json or .npz)", None),
     new_data: bool = switch("the observations are others than those it was made from"),
-    held_out: bool = switch("say, too, which lens predicts held-out parts best, as `calibrate` does"),
-    strict: bool = switch("exit with 1 for any finding, also one that does no harm"),
-    false_alarms: float = arguments.false_alarms_option("probability of any finding where nothing is wrong"),
+    held_out: bool = switch("also report which lens predicts held-out parts best, as `calibrate` does"),
+    strict: bool = switch("exit with 1 for any finding, even if it is harmless"),
+    false_alarms: float = arguments.false_alarms_option("probability of a finding if nothing is wrong"),
 ) -> Document:
     files.require_outputs(args, [calibration, *observations])
     files.require_output(output, [], "the table is", ".csv", ".json", ".npz")

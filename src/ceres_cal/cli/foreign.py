@@ -26,7 +26,7 @@ def _listed(forms: Iterable[formats.ExportFormat | formats.ImportFormat]) -> str
 
 @command(
     "export",
-    "a calibration in a format that others read, and what that loses",
+    "export a calibration to a format of other programs, and report the error",
     "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
     "calibration.json --to opencv -o camera.yml",
     "calibration.json --to table -o table.npz --error-mm 0.05",
@@ -37,7 +37,7 @@ def export(
     station: tuple[str, ...] = option(
         "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
     ),
-    max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm")),
+    max_loss_mm: float | None = option("refuse a larger error anywhere on the field", "MM", read=length("mm")),
     to: str = option(
         lambda: _listed(formats.EXPORT_FORMATS.values()), "FORMAT", REQUIRED, elsewhere=("format", "from")
     ),
@@ -80,7 +80,7 @@ def _typed(
             plain = str(parse_length(text, flag(name), "mm")) if name.endswith("_mm") else text
             options[name] = msgspec.convert(plain, types[name], strict=False)
         except (msgspec.ValidationError, UnicodeEncodeError):  # a word that is not UTF-8 is refused, too
-            raise InputError(f"{flag(name)}: {text!r} is not the number or word that it takes") from None
+            raise InputError(f"{flag(name)}: {text!r} is not a valid value") from None
     return options
 
 
@@ -171,7 +171,7 @@ def _group(args: GroupArguments) -> formats.Group:
 
 @command(
     "publish",
-    "send a calibration to those who see the field, by the league's multicast",
+    "send a calibration by the league's multicast",
     "calibration.json --camera-id 0",
     "calibration.json --geometry geometry.yml --once",
 )
@@ -182,9 +182,7 @@ def _publish(
     camera_id: str = option("of the stations; default: the number that each name ends in", "ID,...", ""),
     geometry: Path | None = option("with the field, and other cameras: .pb or geometry.yml", "FILE"),
     once: bool = switch("one packet, not one every 3 s until Ctrl-C"),
-    max_loss_mm: float | None = option(
-        "refuse what the message would get wrong by more on the field", "MM", read=length("mm")
-    ),
+    max_loss_mm: float | None = option("refuse a message with a larger error on the field", "MM", read=length("mm")),
 ) -> Document:
     packet, exported = formats.ssl_packet(read_calibration(calibration), station or None, camera_id, geometry)
     exported.require_loss_mm(max_loss_mm)

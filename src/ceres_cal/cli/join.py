@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def _run(
     observations: tuple[str, ...] = argument("OBS", "files of observations, of all cameras"),
     same_frame: str | None = option(
-        "which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
+        "which frames are one moment: 'left*,right*' (the part at * names it), index (the n-th of each "
         "camera), or within:0.01 (frames are named by time stamps); default: those of one name",
         "RULE",
     ),
@@ -59,7 +59,7 @@ def _sections(labels: start.Labels, same_frame: str | None) -> Iterator[Section]
     moments = {str(count): number for count, number in by_count}
     yield Section("moments", wrapped(f"{seen} (frames {rule})"), {"moments_by_cameras": moments})
     which = ", ".join(f"{placement!r} of {station!r}" for station, placement in labels.turned)
-    turned = wrapped(f"turned, to be those of the first camera: {which}") if which else []
+    turned = wrapped(f"labels turned to match the first camera: {which}") if which else []
     yield Section("labels", turned, {"turned": labels.turned, "open": labels.open})
     for station in labels.open:
         yield Section("warning", wrapped(start.open_words(station)))

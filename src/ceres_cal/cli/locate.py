@@ -139,7 +139,7 @@ def _why_not_located(camera: scene.Camera, pixel: base.Array, height_m: float) -
 
     radius = camera.lens.monotone_radius(camera.phi)
     if camera.rays(pixel[None])[0, 0] != camera.rays(pixel[None])[0, 0]:
-        reach = f"past the {radius:.0f} px from the principal point where the lens has one answer"
+        reach = f"more than {radius:.0f} px from the principal point, where the lens cannot be inverted"
         return f"it lies {reach if radius < np.inf else 'too far outside the image for the lens'}"
     if not scene.in_image(pixel, camera.image_size):
         return "it lies outside the image of {} x {} px: check its coordinates".format(*camera.image_size)
@@ -149,7 +149,7 @@ def _why_not_located(camera: scene.Camera, pixel: base.Array, height_m: float) -
 def _why_not_projected(camera: scene.Camera, point: base.Array) -> str:
     if camera.cam_from_world.transform(point)[2] <= 0.0:
         return "it lies behind the camera"
-    return "it lies outside of what the lens can show"
+    return "it lies outside the field of view of the lens"
 
 
 def _answer(data: dict[str, Any], values: base.Array, lost: dict[int, str]) -> Document:

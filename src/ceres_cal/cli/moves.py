@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 )
 def _check(
     args: InputArguments,
-    false_alarms: float = arguments.false_alarms_option("how often unmoved cameras may be said to have moved"),
+    false_alarms: float = arguments.false_alarms_option("probability of reporting a move if no camera moved"),
     checks: int = option(
-        "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
+        "this probability is for N checks of this calibration together: 720 for an hourly check over a month",
         "N",
         1,
         read=whole(1),
@@ -100,12 +100,12 @@ def _score(
     calibration: Path = arguments.calibration_argument(),
     observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together"),
     hold_stations: bool = switch(
-        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too"
+        "hold the calibrated poses of stations and solve for those of boards only: tests the poses of a rig, too"
     ),
     loss: arguments.Loss | None = option("default: the calibration's"),
     reject_sigma: float | None = option(
-        "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
-        "trivial the rms is the one that other programs state",
+        "observations with larger residuals are rejected; default: the calibration's. inf keeps all, and with --loss "
+        "trivial the rms compares with that of other programs",
         "SIGMA",
         read=float,
     ),
@@ -236,7 +236,7 @@ def _compare(
     picture: Path | None = option("draw the map there (of one station)", "SVG"),
     over_image: bool = switch("intrinsics, over the image in px; default where there is no field"),
     without_turn: bool = switch(
-        "likewise, but take out the turn that brings both nearest: another principal point looks much like it"
+        "likewise, after the rotation that aligns both best: another principal point looks much like a rotation"
     ),
 ) -> Document:
     files.require_output(picture, [a, b], "pictures are", ".svg")
@@ -311,7 +311,7 @@ def _explained(one: moves.Agreement) -> str:
     return {
         True: f"explained by their uncertainties (probability {one.probability:.2g})",
         False: f"more than their uncertainties explain (probability {one.probability:.1g})",
-        None: "no statement on uncertainty: their lenses have other numbers, or one calibration has no uncertainty",
+        None: "not tested: their lenses have different coefficients, or one calibration has no uncertainty",
     }[one.holds]
 
 

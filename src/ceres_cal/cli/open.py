@@ -76,7 +76,7 @@ def _sitting(files: Sequence[str], folder: Path, target: str) -> cli.PageContext
     for path in calibrations:
         json_object(path)
     if len(calibrations) > most_calibrations:
-        raise InputError(f"{calibrations[most_calibrations]}: at most two calibrations are looked at over one picture")
+        raise InputError(f"{calibrations[most_calibrations]}: compare at most two calibrations over one picture")
     if not photographs:
         raise InputError(f"{calibrations[0]}: a calibration holds no picture: name a photograph, too")
     names = [path.name for path in photographs]
@@ -93,7 +93,7 @@ def _sections(session: cli.Session) -> Iterator[Section]:
     folder = session.sitting.folder
     yield Section("", [], {"folder": str(folder), "commands": list(session.written)})
     if not session.written:
-        yield Section("written", [f"nothing but what was shown by hand: {folder}/page.json"])
+        yield Section("written", [f"only the points placed by hand: {folder}/page.json"])
         return
     yield Section("written", [f"{folder}/, by {plural(len(session.written), 'command')}:"])
     yield Section("", session.written)

@@ -54,8 +54,8 @@ def photographs_in(args: InputArguments) -> list[Path]:
         return []
     if observed:
         raise InputError(
-            f"{observed[0]}: observations beside photographs: give one kind, `ceres-cal detect field` makes "
-            "observations of photographs"
+            f"{observed[0]}: observations cannot be mixed with photographs: give one kind; `ceres-cal detect field` "
+            "makes observations from photographs"
         )
     images = image_files(args.inputs)
     require_different(images)
@@ -172,14 +172,14 @@ class BoardArguments(QuietArguments, DetectArguments):
         beside=("gap",),
     )
     gap: float | None = option(
-        "with --april-grid: between tags, over their side (tagSpacing)",
+        "with --april-grid: gap between tags divided by their side (tagSpacing)",
         "SHARE",
         beside=("april_grid",),
     )
     circles: float | None = option(
-        "a grid of circles, so far apart, instead of squares", "M", read=length("m"), beside=("diameter",)
+        "a grid of circles at this distance, instead of squares", "M", read=length("m"), beside=("diameter",)
     )
-    asymmetric: bool = switch("with --circles: every other row half a step aside, M as in OpenCV", beside=("circles",))
+    asymmetric: bool = switch("with --circles: every other row half a step off, M as in OpenCV", beside=("circles",))
     diameter: float | None = option("with --circles: of a circle", "M", read=length("m"), beside=("circles",))
     charuco: str | None = option(
         "the board has markers of this OpenCV dictionary, such as DICT_4X4_50", "DICT", beside=("marker",)
@@ -189,8 +189,8 @@ class BoardArguments(QuietArguments, DetectArguments):
     )
     legacy: bool = switch("with --charuco: made with OpenCV before 4.6", beside=("charuco",))
     corner_fit: Literal["saddle", "opencv"] = option(
-        "measure corners by the saddle around each (default), also of boards partly out of the picture, or as "
-        "OpenCV does, whole boards alone",
+        "measure corners by a saddle fit (default), also of boards partly outside the picture, or as OpenCV does, "
+        "of whole boards only",
         default="saddle",
     )
     frames: int = frames_option()

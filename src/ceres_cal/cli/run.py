@@ -34,7 +34,7 @@ class RunArguments(QuietArguments):
     output: Path = arguments.output_option("everything that is made", metavar="FOLDER")
     target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
     facing: tuple[str, ...] = option(
-        "which way round it is, likewise; of several cameras CAMERA.NAME=SIDE",
+        "its orientation, as of `detect field`; of several cameras CAMERA.NAME=SIDE",
         "NAME=SIDE",
         repeatable=True,
         beside=("target",),
@@ -140,8 +140,8 @@ def _require_tied(cameras: Sequence[RunArguments], seen: Sequence[Sequence[_Step
     alone = {kind: one.camera for kinds, one in zip(shown, cameras, strict=True) if len(kinds) == 1 for kind in kinds}
     if len(alone) > 1 and all(len(kinds) == 1 for kinds in shown):
         raise InputError(
-            f"{alone['board']!r} shows boards alone and {alone['field']!r} the field alone, so nothing ties these "
-            "cameras: if one camera took both, name it, such as --camera overhead"
+            f"{alone['board']!r} shows boards alone and {alone['field']!r} the field alone, so these cameras are not "
+            "connected: if one camera took both, name it, such as --camera overhead"
         )
 
 

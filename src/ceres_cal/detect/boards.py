@@ -156,7 +156,7 @@ def _find_all(
         if own_size != size:
             raise InputError(
                 f"{path}: {own_size[0]} x {own_size[1]} px, but {paths[0]} has {size[0]} x {size[1]}: "
-                "images of another size are another camera's, detect them on their own"
+                "detect images of another size, which another camera took, separately"
             )
         if isinstance(grid, str):
             missed.append((str(path), grid))
@@ -364,7 +364,7 @@ def _enough(grid: Array) -> Array | str:
     if len(row) < MIN_CORNERS:
         return f"only {len(row)} corners, {MIN_CORNERS} are needed"
     if max(np.bincount(row).max(), np.bincount(column).max()) >= len(row) - 1:
-        return f"its {len(row)} corners lie in one row or column (but for one at most)"
+        return f"its {len(row)} corners lie in one row or column (except for one at most)"
     return grid
 
 

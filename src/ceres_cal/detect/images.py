@@ -119,7 +119,7 @@ def _in_levels(image: AnyArray | None, channels: int, path: str) -> Image | None
     if image is None:
         return None
     if not np.isfinite(image).all():
-        raise InputError(f"{path}: some of its pixels are no finite numbers: convert it to PNG")
+        raise InputError(f"{path}: some of its pixels are not finite: convert it to PNG")
     levels = image.astype(np.float32) * np.float32(255.0 / max(float(np.max(image)), 1e-9))
     return cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY) if levels.ndim == 3 and channels == cv2.IMREAD_GRAYSCALE else levels
 
@@ -129,13 +129,11 @@ def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
     to show anything.
     """
     if min(size) < _LEAST_PX:
-        raise InputError(
-            f"{path}: {size[0]} x {size[1]} px is no photograph: at least {_LEAST_PX} px are needed each way"
-        )
+        raise InputError(f"{path}: {size[0]} x {size[1]} px is too small: at least {_LEAST_PX} px are needed each way")
     pixels = size[0] * size[1]
     require_room(_BYTES_PER_PIXEL * pixels, f"{path}: an image of {size[0]} x {size[1]} px")
     if pixels > _PIXELS_PER_BYTE * length:
-        raise InputError(f"{path}: {size[0]} x {size[1]} px, as it says, do not fit into {length} bytes: leave it out")
+        raise InputError(f"{path}: {size[0]} x {size[1]} px cannot be stored in its {length} bytes: leave it out")
 
 
 def filled(grey: Array32, left_out: Mask) -> Array32:

@@ -68,8 +68,8 @@ def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
         chosen = max((chosen, *(_agreeing(greys, sharp, some) for some in (sharp[:half], sharp[half:]))), key=len)
     if len(chosen) < min(len(sharp), 2):
         raise InputError(
-            f"no two of {len(names)} pictures show the same: one is made of those of a camera that stands still, give "
-            "them one by one"
+            f"no two of {len(names)} pictures agree, and a median needs a camera that does not move: give the pictures "
+            "one by one"
         )
     left_out |= {n: "the camera had moved" for n in sharp if n not in chosen}
     return MedianPicture(
@@ -108,7 +108,7 @@ def _read(pictures: Iterable[tuple[str, Image]]) -> tuple[list[str], list[Image]
         names.append(name)
         greys.append(grey)
     if not greys:
-        raise InputError("there is no picture to be seen: give some")
+        raise InputError("no pictures are given: give at least one")
     return names, greys
 
 

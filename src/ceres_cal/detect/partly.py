@@ -28,7 +28,7 @@ _CLEAR = 0.2  # share of the corners' spacing, from the border: a predicted corn
 _ENDED = 0.7
 # Offsets from a corner, in squares: a corner is predicted to a tenth of a square.
 _QUARTERS = np.array([-0.35, -0.2, 0.2, 0.35])
-NO_PLACE = "no place on it"
+NO_PLACE = "do not fit on the board"
 
 
 def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array | str:
@@ -39,12 +39,12 @@ def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array |
     """
     grown = _grown(image, seed, max(columns, rows))
     if np.isnan(steps_px(grown.grid)).all():
-        return f"no chessboard of {columns} x {rows} inner corners found, but squares without neighbours"
+        return f"no chessboard of {columns} x {rows} inner corners found, only isolated squares"
     places = list(_places(grown, image.shape, columns, rows))
     if len({missing for missing, _ in places}) != 1:
         width, height = sorted(grown.contrast.shape, reverse=columns >= rows)
-        why = "more than one place on it" if places else NO_PLACE
-        found = f"but {width} x {height} corners, which have {why}"
+        why = "fit on the board in several positions" if places else NO_PLACE
+        found = f"but {width} x {height} corners, which {why}"
         return f"no chessboard of {columns} x {rows} inner corners found, {found}"
     return places[0][1]
 

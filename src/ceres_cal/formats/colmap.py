@@ -98,7 +98,7 @@ def read_model(folder: Path) -> Any:
 def _read(request: ImportRequest) -> Any:
     model = read_model(request.path)
     if not model.num_images():
-        raise InputError("the model has no image: where its cameras stood is not said")
+        raise InputError("the model has no images, so the poses of its cameras are unknown")
     cameras, warnings = {}, []
     for image in model.images.values():
         name = _name(image)
@@ -113,7 +113,7 @@ def _read(request: ImportRequest) -> Any:
     # Otherwise images in different folders have the same name: whole names distinguish them.
     if len(stems) == len(cameras):
         cameras = stems
-    warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")
+    warnings.append("COLMAP models have no unit of length: these lengths are read as metres")
     return calibration_of("COLMAP", cameras, warnings=warnings)
 
 

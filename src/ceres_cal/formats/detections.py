@@ -34,7 +34,7 @@ def _read_corners(
 ) -> Observations:
     """Read `# filename x y level`, one line for each corner, row by row; '-' or a level below 0 means not found."""
     if min(columns, rows) < 2 or not square > 0.0:
-        raise InputError("the board is not said in the file: give columns, rows and square (m)")
+        raise InputError("the file does not describe the board: give columns, rows and square (m)")
     board = checkerboard(columns, rows, square)
     found: dict[str, list[tuple[float, float, float]]] = {}
     for number, line in enumerate(request.text.splitlines(), start=1):
@@ -56,7 +56,7 @@ def _read_corners(
     size = parse_size(image_size)
     frames = {Path(name).stem: corners[:, :2] for name, corners in whole.items()}
     if len(frames) != len(whole):
-        raise InputError("two images are called alike but for their folders: import one camera at a time")
+        raise InputError("two images in different folders have the same name: import one camera at a time")
     bare = Observations.from_points(frames, board, size, camera=camera)
     level = np.concatenate([corners[np.isfinite(corners[:, 0]), 2] for corners in whole.values()])
     return replace(bare, points=replace(bare.points, sigma_px=sigma_px * level))
@@ -102,7 +102,7 @@ def _npz_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tupl
     require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
     lengths = {array.shape for array in columns.values()}
     if len(lengths) != 1 or any(len(shape) != 1 for shape in lengths):
-        raise InputError(f"the columns must be of one dimension and as long as one another, not {sorted(lengths)}")
+        raise InputError(f"the columns must be one-dimensional and of equal length, not {sorted(lengths)}")
     rows = [dict(zip(columns, map(str, row), strict=True)) for row in zip(*columns.values(), strict=True)]
     return rows, tuple(columns)
 
@@ -168,7 +168,7 @@ def _target(name: str, places: Sequence[tuple[float, float, float]], moves: bool
     if places:
         return of_places({_place_name(place): place for place in places}, moves=moves)
     if (known := target_named(name)) is None:
-        what = f"target {name!r} is unknown" if name else "whose features these are is not said"
+        what = f"target {name!r} is unknown" if name else "the target of these features is not given"
         raise InputError(f"{what}: give a target, one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
     return known
 
@@ -200,7 +200,7 @@ def _read_mrcal(request: ImportRequest) -> Observations:
     """Read the `optimization_inputs` of a .cameramodel: boards before static cameras."""
     data = literal_of(request.content)
     if "optimization_inputs" not in data:
-        raise InputError("it has no optimization_inputs: mrcal did not keep what it calibrated from")
+        raise InputError("it has no optimization_inputs: mrcal did not store its observations")
     try:
         given = read_foreign_npz(base64.b85decode(data["optimization_inputs"]), str(request.path))
         boards = np.asarray(given["observations_board"], dtype=float)

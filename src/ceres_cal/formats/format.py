@@ -53,8 +53,8 @@ class Export(Frozen):
             worst = max((worst for _, worst in loss.field_mm.values()), default=float("inf"))
             if not worst <= most:  # type: ignore[operator]
                 raise InputError(
-                    f"station {loss.station!r}: the format would be wrong by {short(worst, 3)} mm on the field, more "
-                    f"than {most:g}: calibrate with a lens that it holds, or allow for more"
+                    f"station {loss.station!r}: the export would be off by {short(worst, 3)} mm on the field, more "
+                    f"than {most:g} mm: calibrate with a lens that the format supports, or allow a larger error"
                 )
 
     def save(self, path: str | Path) -> None:
@@ -186,10 +186,10 @@ def calibration_of(
             continue
         ours[name], (rms, worst) = given.camera()
         if worst > 0.0:
-            what = f"its {given.model} model is held as the nearest {ours[name].lens.kind} lens"
+            what = f"its {given.model} model is approximated by the nearest {ours[name].lens.kind} lens"
             told.append(f"camera {name!r}: {what}, off by {short(rms)} px rms and {short(worst)} px at most")
         if given.cam_from_world is None:
-            told.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
+            told.append(f"camera {name!r}: the file has no pose over a field, so the camera defines the world")
     stations = {name: Station(name, camera.cam_from_world) for name, camera in ours.items()}
     bare = {name: camera.at(type(camera.cam_from_world).identity()) for name, camera in ours.items()}
     lenses = {name: camera.lens for name, camera in ours.items()}

@@ -57,7 +57,7 @@ def _read(request: ImportRequest) -> Any:
         if "T_cn_cnm1" in entry:
             pose = _pose(entry, key) @ (pose or Pose.identity())
         elif key != "cam0":
-            raise InputError(f"{key} has no T_cn_cnm1: where it stands is not said")
+            raise InputError(f"{key} has no T_cn_cnm1, so its pose is unknown")
         cameras[name] = _camera(entry, key, pose)
     return calibration_of("a Kalibr camchain", cameras)
 

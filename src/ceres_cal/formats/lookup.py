@@ -142,7 +142,7 @@ def make_lookup_table(
         if max(worst for _, worst in table.error_mm.values()) <= error_mm:
             return table
     if step_px is None or table is None:
-        raise InputError(f"no table with a step of 1 px or more keeps to {error_mm:g} mm: allow for more")
+        raise InputError(f"no table with a step of 1 px or more keeps to {error_mm:g} mm: allow a larger error")
     return table
 
 

@@ -79,8 +79,8 @@ def camera_loss(station: str, camera: scene.Camera, project: Callable[[Array], A
     field_mm = field_error_mm(camera, locate, field_pixels(camera, box_m), box_m, HEIGHTS_M)
     if not np.all(np.isfinite(list(field_mm.values()))):
         raise InputError(
-            f"station {station!r}: the camera sees so wide that nothing in this format shows all of the field as it "
-            "does: take another format, such as table, or name a lens that this one holds"
+            f"station {station!r}: the field of view is too wide for this format, which cannot show all of the field: "
+            "use another format, such as table, or calibrate with a lens that this one supports"
         )
     return ExportLoss(station, field_mm, image_px)
 
@@ -119,6 +119,6 @@ def loss_words(loss: ExportLoss) -> list[str]:
     if loss.image_px is not None:
         rms, worst = loss.image_px
         shown = f"{short(rms, 3)} px rms, {short(worst, 3)} px at most"
-        off = shown if np.isfinite(rms) else "some of it is not shown at all"
+        off = shown if np.isfinite(rms) else "part of the image cannot be shown"
         lines.append(f"{loss.station}: {off}, over the image")
     return lines

@@ -51,7 +51,7 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
     import cv2
 
     if camera.model == FISHEYE:
-        return ["its numbers are those of cv2.fisheye, which a file cannot say: `distortion_model` does"]
+        return ["its coefficients are for cv2.fisheye: OpenCV does not read this from the file, see `distortion_model`"]
     pixels, coefficients = image_grid(camera.image_size), np.array(camera.coefficients)
     straight = cv2.undistortPoints(pixels[:, None], camera.matrix, coefficients)[:, 0]
     rays = np.column_stack([straight, np.ones(len(straight))])
@@ -59,7 +59,7 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
     if worst <= rough_px:
         return []
     end = "criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)"
-    return [f"cv2.undistortPoints stops after five rounds, here up to {two_digits(worst)} px off: give it {end}"]
+    return [f"cv2.undistortPoints stops after five rounds, here up to {two_digits(worst)} px off: call it with {end}"]
 
 
 def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:

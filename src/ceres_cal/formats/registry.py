@@ -138,7 +138,7 @@ def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat
             return form
     if b'"ceres-cal/' in content[:4096]:
         raise InputError(f"{path}: a file of ceres-cal, not of another program: give it without an import")
-    raise InputError(f"{path}: of no format that is known by its ending and content: name one of {known}")
+    raise InputError(f"{path}: its format is not recognised by ending and content: name one of {known}")
 
 
 def _stations(calibration: Calibration, form: ExportFormat, names: Sequence[str] | None) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ def _stations(calibration: Calibration, form: ExportFormat, names: Sequence[str]
         calibration.station(name)
     if not form.holds(len(chosen)):
         most = "one station" if form.most_stations == 1 else f"{form.most_stations} stations at most"
-        raise InputError(f"a file of format {form.name} holds {most}, not {len(chosen)}: say which")
+        raise InputError(f"a file of format {form.name} holds {most}, not {len(chosen)}: name the stations")
     return chosen
 
 

@@ -72,9 +72,9 @@ def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]
     other = nearest_foreign(camera, loss.station, opencv_models(camera), box_m)[1]
     left = max(worst for _, worst in other.field_mm.values())
     return [
-        f"one coefficient does not hold this lens, {short(worst, 3)} mm are lost at most: to lose less, read --to "
-        f"opencv ({short(left)} mm at most) or --to table in your own software, or let more cameras see less of the "
-        "field each"
+        f"one coefficient cannot describe this lens (error up to {short(worst, 3)} mm): for less, use --to opencv "
+        f"({short(left)} mm at most) or --to table in your own software, or more cameras, each seeing less of the "
+        "field"
     ]
 
 
@@ -93,8 +93,8 @@ def reader_traps(entry: Mapping[str, Any]) -> list[str]:
     """Return what readers of an entry may get wrong."""
     if float(entry["distortion"]) < 0.0:
         return [
-            "its distortion is negative: ssl-vision locates with it but draws, and states its own RMSE, without "
-            "(its issue 148); vision-processor takes either sign"
+            "its distortion is negative: ssl-vision uses it to locate, but not to draw or to compute its RMSE "
+            "(its issue 148); vision-processor supports both signs"
         ]
     return []
 
@@ -166,7 +166,7 @@ def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
     turn, shift = np.array(rest[:4]), np.array(rest[4:])
     norm = float(np.linalg.norm(turn))
     if not (f > 1.0 / LARGEST and abs(norm - 1.0) < 0.05):
-        raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, makes no camera")
+        raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, is impossible")
     sizes = [entry.get("pixel_image_width"), entry.get("pixel_image_height")]
     width, height = (int(float(size)) for size in sizes) if all(sizes) else parse_size(image_size)  # type: ignore[arg-type]
     pose = Pose(rotation_of(turn), 1e-3 * shift)

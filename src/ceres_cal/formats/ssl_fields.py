@@ -44,7 +44,7 @@ def target_of(field: Mapping[str, Any]) -> Target:
     try:
         curves = _curves(field)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"a line or an arc of the field has something else than its numbers: {error}") from None
+        raise InputError(f"a line or an arc of the field has an invalid value: {error}") from None
     division = _division_of(field["field_length"])
     given = {ours: 1e-3 * float(field[name]) for name, ours in _SIZES.items() if field.get(name)}
     by_rule, nominal = ssl_field(division), ssl_field(division, **given)

@@ -33,7 +33,7 @@ def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any
     elif targets:
         size = field_of(next(iter(targets.values())))
     else:
-        raise InputError("the message needs a field, and the calibration has none: export into a file that has one, "
+        raise InputError("the message needs a field, but the calibration has none: export into a file with a field, "
                          "such as one that `ceres-cal listen` wrote")  # fmt: skip
     entries, losses, warnings = to_entries(request, camera_id, field_box(targets))
     others = {int(entry["camera_id"]): dict(entry) for entry in before.get("calib") or []}

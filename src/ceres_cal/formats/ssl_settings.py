@@ -150,8 +150,8 @@ def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -
     most_tz_mm, distortion = 6500.0, (-1.0, 2.0)  # ssl-vision clamps to these when it reads
     if not 0.0 <= entry["tz"] <= most_tz_mm:
         raise InputError(
-            f"camera {number}: its tz {entry['tz']:.0f} mm is not between 0 and {most_tz_mm:.0f}, to which ssl-vision "
-            "clamps it: such a camera cannot be loaded"
+            f"camera {number}: its tz {entry['tz']:.0f} mm is not between 0 and {most_tz_mm:.0f}, the range of "
+            "ssl-vision, which cannot load this camera"
         )
     if not distortion[0] <= entry["distortion"] <= distortion[1]:
         raise InputError(f"camera {number}: ssl-vision clamps its distortion {entry['distortion']:.3g} to [-1, 2]")
@@ -174,7 +174,7 @@ def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
         if _OPENCV in there and there[_OPENCV].text == "true":
             warnings.append(
                 f"camera 'camera{number}': ssl-vision's OpenCV mode is on, which ignores all distortion when it "
-                "locates: what was read are the numbers of its own model"
+                "locates: the numbers of its own model were read instead"
             )
     return calibration_of("ssl-vision's settings", cameras, {"field": settings_target(values)}, warnings)
 

@@ -33,7 +33,7 @@ def read_yaml(text: str) -> dict[str, Any]:
     if not (isinstance(data, dict) and all(isinstance(name, str) for name in data)):
         raise InputError("not a YAML file of names and values")
     if math.isinf(size):
-        raise InputError("something in its YAML holds itself: correct that")
+        raise InputError("its YAML contains a reference to itself: remove it")
     require_room(bytes_per_value * size, "its YAML")
     return data
 

@@ -181,7 +181,7 @@ def _of_faults(quality: Quality) -> tuple[str, str]:
         else "care"
     )
     counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
-    moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
+    moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} standard deviations"
     wrong_mm = mm(_largest_mm(quality.faults))
     names = first_of(list(dict.fromkeys(f"{fault.kind} ({fault.subject})" for fault in quality.faults)), 4)
     return level, f"The model is wrong by up to {wrong_mm} rms: {names}. This moves {moved}. {counted_in}."
@@ -198,7 +198,7 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     likely = [f"'{one.kind} by {mm(1e3 * one.sigma)}' is {100.0 * one.probability:.0f} % likely" for one in floors]
     if likely:
         included = "the accuracy includes this, and --as-drawn leaves it out"
-        yield "", f"By these observations {' and '.join(likely)}: {included}."
+        yield "", f"According to the observations {' and '.join(likely)}: {included}."
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     # Their effect on places is included in the maps, that on the picture in its radius.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
@@ -337,7 +337,7 @@ def _doubt(quality: Quality) -> str:
     if disputed(quality):
         return "the observations contradict what was stated beforehand"
     if quality.calibration.ambiguities:  # once two solutions were 3.8 m apart, each known to 42 mm
-        return "what a station shows is seen alike from another place"
+        return "the observations of a station fit equally well from another position"
     if noise_ratio(quality) >= LARGE_NOISE:
         return f"the noise is {short(noise_ratio(quality))} times the stated sigma"
     if off := misfit_mm(quality):

@@ -157,7 +157,7 @@ def _camera(quality: Quality, name: str) -> Section:
 
 def _disputed(quality: Quality, of: str = "") -> Iterator[str]:
     if quality.uncertainty and quality.uncertainty.undisputed is not quality.uncertainty:
-        yield f"± sd{of}: without what is contradicted; the 95 % bounds reach to the answer with it"
+        yield f"± sd{of}: without the contradicted statements; the 95 % bounds include the solution with them"
 
 
 def _listed(title: str, about: str, rows: Iterable[_Row], notes: Sequence[str] = ()) -> Section:

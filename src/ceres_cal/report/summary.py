@@ -283,7 +283,7 @@ def advice_of(calibration: Calibration) -> list[dict[str, Any]]:
             "words": promise.measurement.words,
             "steps": list(promise.measurement.steps),
             "kind": promise.measurement.kind,
-            "leaves": f"leaves {mm(promise.after.worst_mm)} of {mm(advice.before.worst_mm)} at the worst place",
+            "leaves": f"reduces the worst error to {mm(promise.after.worst_mm)} from {mm(advice.before.worst_mm)}",
             "shapes": [
                 {"label": label, "pixels": np.round(pixels, 1).tolist()}
                 for label, pixels in places_in_picture(promise.measurement, calibration.targets, camera)

@@ -88,7 +88,7 @@ class Session:
     def _target(self, text: str) -> scene.Target:
         if text not in self._targets:
             if not (text == self.sitting.target or text in scene.targets_by_name() or text.startswith("{")):
-                raise InputError(f"the field {text!r} was not named on the command line, and is none of the list")
+                raise InputError(f"the field {text!r} was not named on the command line and is not in the list")
             self._targets[text] = read_target(text, "field")
         return self._targets[text]
 
@@ -228,13 +228,11 @@ class Session:
         if seen.observations is not None:
             table = diagnostics.diagnose(old, seen.observations, new_data=True).table
             off = np.abs(table.distance_px[np.isfinite(table.distance_px)])
-            said.append(
-                f"its lines are {np.median(off):.2f} px beside the paint in the median, {off.max():.2f} px at most"
-            )
+            said.append(f"its lines are {np.median(off):.2f} px off the paint (median), {off.max():.2f} px at most")
             strokes = report.strokes_of(table)
         if self._other is not None and self.sitting.other is not None:
             apart, name = self._model_of(old, path).apart_px(self._model_of(self._other, path)), self.sitting.other
-            said.append(f"{name} draws them {apart[0]:.2f} px elsewhere in the median, {apart[1]:.2f} px at most")
+            said.append(f"{name} draws them {apart[0]:.2f} px away from these (median), {apart[1]:.2f} px at most")
             for station, one in moves.compare(old, self._other).items():
                 if one.change is not None:
                     floor = one.change.maps[0]

@@ -95,10 +95,10 @@ class FieldAsBuilt(Frozen):
             for name, length in self.dimensions.items()
         ]
         curves = [
-            f"{name} lies {1e3 * abs(aside):.0f} ± {1e3 * self.sd_m[name]:.0f} mm beside its drawing"
+            f"{name} lies {1e3 * abs(aside):.0f} ± {1e3 * self.sd_m[name]:.0f} mm off its nominal position"
             for name, aside in self.aside_m.items()
         ]
-        bent = f"its lines are bent as by no lens, by {1e3 * self.wander_m:.0f} mm"
+        bent = f"its lines are bent, which no lens explains, by {1e3 * self.wander_m:.0f} mm"
         return (*dimensions, *curves, *([bent] if self._is_bent else []))
 
 

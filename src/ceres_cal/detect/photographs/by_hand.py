@@ -142,10 +142,12 @@ def _odd_one(names: list[str], off_px: Array) -> str:
     wrong = [name for name, off in zip(names, off_px, strict=True) if off > _WRONG * SIGMA_PX]
     if len(names) - len(wrong) < FEWEST:
         return (
-            "the points to start from are those of no camera above the target: check names, and that neither they nor "
-            "the picture are mirrored, as if seen from below"
+            "no camera above the target sees the points to start from at these pixels: check names, and that neither "
+            "the points nor the picture are mirrored"
         )
-    return f"point {wrong[0]!r} to start from lies {off_px.max():.0f} px from where the others have it: check its name"
+    return (
+        f"point {wrong[0]!r} to start from lies {off_px.max():.0f} px from where the others predict it: check its name"
+    )
 
 
 # ---- dragged by hand ------------------------------------------------------------------------------------------------

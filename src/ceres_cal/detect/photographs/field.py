@@ -223,7 +223,7 @@ def _of_one_place(results: Mapping[str, SearchResult]) -> dict[str, SearchResult
         if result.followed is not None:
             near[0].append(path) if near else groups.append([path])
     most = max(groups, key=len, default=[])
-    said = "{:.0f} px from where {} {} it: taken by another camera, or after this one was moved: give it on its own"
+    said = "{:.0f} px from where {} {} it: another camera took it, or the camera was moved: detect it separately"
     kept = dict(results)
     for path in (path for own in groups if own is not most for path in own):
         away, shown = _apart_px(results[most[0]], results[path]), "shows" if len(most) == 1 else "show"
@@ -239,7 +239,7 @@ def _together(paths: Sequence[Path], looked_for: Callable[[Path, Array32], Searc
         InputError: they cannot be combined, or the combined picture shows no field either.
     """
     one = merged((str(path), read_colour(path)) for path in paths[:: -(-len(paths) // MOST_PICTURES)])
-    name = f"{one.used[0]} and {len(one.used) - 1} more, together"
+    name = f"{one.used[0]} and {len(one.used) - 1} more, combined"
     result = looked_for(Path(name), one.picture)
     if result.followed is None:
         raise InputError(result.reason)
@@ -291,9 +291,7 @@ def require_findable(
         raise InputError(f"the field reaches {target.reach_m:.0f} m from its origin: give its dimensions in metres")
     for prior in lengths:
         if not features_of(target, prior.quantity) & set(painted):
-            raise InputError(
-                f"no painted line lies elsewhere with another {prior.quantity}: it cannot be found, leave it out"
-            )
+            raise InputError(f"no painted line depends on {prior.quantity}: it cannot be found, leave it out")
     return painted
 
 
@@ -385,7 +383,7 @@ def _starts(
         width, height = camera.image_size
         other = f"but the camera has {width} x {height}: start from a calibration of this camera"
         if isinstance(start, FieldLines):
-            other = "unlike the images before: give it on its own"
+            other = "unlike the images before: detect it separately"
         raise InputError(f"{size[0]} x {size[1]} px, {other}")
     return [camera], FreeIntrinsics(priors=lengths)
 

@@ -160,7 +160,7 @@ def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[
             raise InputError(f"facing: {no_such('line or point', one.feature, (*target.curves, *target.point_index))}")
         if np.linalg.norm(_place(one.feature, target) - middle) < _MIDDLE * size:
             raise InputError(
-                f"facing {one.feature}={one.side}: {one.feature} lies in the middle of the field, towards no side: "
+                f"facing {one.feature}={one.side}: {one.feature} lies in the middle of the field, not towards a side: "
                 "name another line or point"
             )
 

@@ -51,12 +51,12 @@ def why_missed(followed: FieldLines, target: Target, *, started: bool) -> str:
     """
     if followed.built.is_other:
         asked = ",".join(name.removesuffix("_m") for name in followed.built.dimensions)
-        help_ = f": correct the target, or have it found (--estimate {asked})" if asked else ""
+        help_ = f": correct the target, or estimate it (--estimate {asked})" if asked else ""
         return "; ".join(followed.built.words()) + help_
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
-        return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
-    share = f" (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them)" if started else ""
+        return f"{names} were not found at their places: say which lines are not painted, or check the dimensions"
+    share = f" (paint at {100.0 * followed.share:.0f} % of where this start, refined, predicts it)" if started else ""
     elsewhere = "start from other points" if started else "start from corners"
     return f"its lines were not found{share}: check the target's dimensions and which lines are painted, or {elsewhere}"
 
@@ -67,7 +67,7 @@ def objection(search: FieldSearch, followed: FieldLines) -> str:
         return why_missed(followed, search.grid.target, started=False)
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
-        return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
+        return f"only {', '.join(names)} would be in the picture, too few lines to find a field: start from corners"
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not is_lens(followed.camera):
         return "its lines were not found in any view from above: start from corners"
     share, of_all = explained(search, followed)
@@ -77,7 +77,7 @@ def objection(search: FieldSearch, followed: FieldLines) -> str:
     if told < (_IF_AS_DRAWN if as_drawn else _NO_CHANCE) and np.any(np.less((share, of_all), needed)):
         share = min(share, of_all)
         return (
-            f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
+            f"only {100.0 * share:.0f} % of the bright lines in the area of the field belong to it: "
             "check the target's dimensions and which lines are painted, or start from corners"
         )
     return ""

@@ -43,8 +43,8 @@ class KnownDetections(Frozen):
         if self.observations is None:
             path, reason = self.missed[0]
             raise NothingShownError(
-                f"nothing that the calibration knows was found in {_counted(self.images)}, within {_REACH} of where "
-                f"it was: after a larger move detect the field from its corners first; {path}: {reason}",
+                f"no target of the calibration was found in {_counted(self.images)} within {_REACH} of its predicted "
+                f"position: after a larger move detect the field from its corners first; {path}: {reason}",
                 self.missed,
             )
         return self.observations
@@ -140,7 +140,7 @@ def check_photographs(
     if detections.observations is not None:
         return check(calibration, detections.observations, false_alarms, checks), detections
     words = (
-        f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
+        f"not found: no field within {_REACH} of its predicted position in {_counted(len(images))}: the camera moved "
         "farther, or it sees no field (dark, covered, other lines): look at the picture"
     )
     return Agreements({detections.station: not_found(detections.station, words)}, false_alarms, checks), detections

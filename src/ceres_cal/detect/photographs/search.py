@@ -47,7 +47,7 @@ _AS_GOOD = 0.87
 _MOST_REFINED = 2
 OTHER = "it shows {0}: give that as the target (--target {0})"
 _NO_LINES = (
-    "no lines at right angles that could be this field's, two one way and one across: "
+    "no lines at right angles (two in one direction, one across) that fit this field: "
     "check the target's dimensions, or start from corners"
 )
 
@@ -234,7 +234,7 @@ def _one_way(problem: FieldSearch, distinct: Sequence[FieldLines]) -> SearchResu
         raise SeveralWaysError(_contradiction(ways, problem.asked.facing, target, curves), followed)
     if len(agreeing) > 1:
         raise SeveralWaysError(
-            f"the field is found, but it looks alike in {len(agreeing)} ways: "
+            f"the field was found, but {len(agreeing)} orientations look the same: "
             f"{_sides([ways[number] for number in agreeing], target, curves)}",
             followed,
         )
@@ -255,8 +255,8 @@ def _contradiction(ways: Sequence[Camera], facing: Sequence[Facing], target: Tar
     """Message that no view agrees with all of what is known."""
     given = ", ".join(f"{one.feature}={one.side}" for one in facing)
     if len(facing) > 1 and all(agreeing_with_facing(ways, [one], target, curves) for one in facing):
-        return f"{given} hold together in a mirrored picture only: mirror it back, or check them"
-    return f"not with {given}: in this photograph {_sides(ways, target, curves)}"
+        return f"{given} agree only if the picture is mirrored: mirror it back, or check them"
+    return f"{given} contradicts the photograph, in which {_sides(ways, target, curves)}"
 
 
 def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -> str:
@@ -265,7 +265,7 @@ def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -
     sides = list(dict.fromkeys(side_of(name, camera, target, curves) for camera in cameras))
     if len(sides) < len(cameras):
         heights = ", ".join(f"{camera.position[2]:.1f} m" for camera in cameras)
-        return f"seen from {heights}, with {name} towards the {' or '.join(sides)}: start from corners instead"
+        return f"the camera is at {heights}, with {name} towards the {' or '.join(sides)}: start from corners instead"
     return (
         f"{name} lies towards the {' or the '.join(sides)} of the picture: "
         f"say which, such as --facing {name}={sides[0]}, or give an old calibration of the station (--start)"

@@ -59,8 +59,8 @@ def frame_by_name(calibration: Calibration, station: str, name: str) -> Frame:
         shown.append((movable[0], name))
     if not shown:
         raise InputError(
-            f"there is nothing to draw into {name!r}: the calibration has no field, and no one board placed under that "
-            "name: give the observations, which say what each frame shows"
+            f"nothing can be drawn into {name!r}: the calibration has no field and no single board with that name: "
+            "give the observations, which say what each frame shows"
         )
     return Frame(name, station, tuple(shown))
 

@@ -212,7 +212,7 @@ export class View {
       context.fillStyle = colour; context.fill();
       context.strokeStyle = "#fff"; context.lineWidth = 1.6; context.stroke();
     }
-    if (one.against) this.label(context, `${one.name}: ${one.off.toFixed(0)} px from where the others have it`, x + 12, y - 12, colour);
+    if (one.against) this.label(context, `${one.name}: ${one.off.toFixed(0)} px from where the others predict it`, x + 12, y - 12, colour);
   }
   stroke(context, [x, y, across, down, out], to) {
     const [a, b] = to([x, y]), [c, d] = to([x + this.enlarged * across, y + this.enlarged * down]);
