@@ -65,12 +65,15 @@ class OtherChangeError(SolutionError):
     """Something other than what was freed has changed.
 
     Attributes:
-        what: one of `WHAT` that explains the observations. rivals: further explanations that may be true.
+        what: one of `WHAT` that explains the observations. rivals: further explanations that may be true. found: the
+            calibration if this one is, where it was solved for.
     """
 
-    def __init__(self, message: str, what: str, rivals: tuple[Rival, ...] = ()) -> None:
+    def __init__(
+        self, message: str, what: str, rivals: tuple[Rival, ...] = (), found: Calibration | None = None
+    ) -> None:
         super().__init__(f"{message}: refit with --what {what}")
-        self.what, self.rivals = what, rivals
+        self.what, self.rivals, self.found = what, rivals, found
 
 
 def labels_turned(pose: Pose, old: Pose) -> tuple[float, float] | None:
@@ -267,9 +270,8 @@ def supported(
     # More support is needed by what absorbs a wrong statement, by another lens, and by what the user did not state.
     is_free = not plan.is_stated and not any(conflict.kind == "prior" for conflict in result.conflicts)
     easily = {plan.what, *(wider[:2] if is_free else ())}
-    misfits, count = _misfits(plan, quiet), len(plan.sights.point_rows) + len(plan.sights.curve_rows)
-    let_go = {what: len(plan.loosened(what)) for what in quiet}
-    scores = {w: misfits[w] + price_nats(let_go[w], count) + _SUPPORTED * (w not in easily) for w in quiet}
+    misfits, let_go = _misfits(plan, quiet), {what: len(plan.loosened(what)) for what in quiet}
+    scores = {w: misfits[w] + _price(plan, w) + _SUPPORTED * (w not in easily) for w in quiet}
     best = min(scores, key=scores.__getitem__)
     # An explanation that gains no more than chance does with a freed number (Akaike's criterion) is no reason to doubt.
     speak_for = [w for w in quiet if w in easily and misfits[w] + let_go[w] <= misfits[plan.what] + let_go[plan.what]]
@@ -284,6 +286,7 @@ def supported(
             f"them less well (by {gain:.0f} nats)",
             best,
             rivals,
+            results[best],
         )
     if judged(plan, plan.what, result).noise >= _TOO_NOISY:
         if not _explains(plan, result):
@@ -328,17 +331,26 @@ def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
 
 def _misfits(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
     """Return the misfit of observations and prior with each explanation, in nats."""
-    sights = plan.sights
     fits = [result.fit for result in results.values()]
     scales = (
         max(plan.scales[0], min(fit.point_scale for fit in fits)),
         max(plan.scales[1], min(fit.curve_scale for fit in fits)),
     )
-    misfits = {}
-    for what, result in results.items():
-        there = residuals(sights, result.estimate)
-        total = 0.5 * judged(plan, what, result).strain
-        for name in sights.cameras:
-            total += there.misfit(sights.of_camera(name), result.cameras[name], scales)
-        misfits[what] = float(total)
-    return misfits
+    return {what: _misfit(plan, what, result, scales) for what, result in results.items()}
+
+
+def _misfit(plan: RefitPlan, what: str, result: Calibration, scales: tuple[float, float]) -> float:
+    sights, there = plan.sights, residuals(plan.sights, result.estimate)
+    seen = sum(there.misfit(sights.of_camera(name), result.cameras[name], scales) for name in sights.cameras)
+    return float(0.5 * judged(plan, what, result).strain + seen)
+
+
+def _price(plan: RefitPlan, what: str) -> float:
+    return price_nats(len(plan.loosened(what)), len(plan.sights.point_rows) + len(plan.sights.curve_rows))
+
+
+def explained_nats(plan: RefitPlan, what: str, result: Calibration, scales: tuple[float, float]) -> float:
+    """Return the misfit of observations and prior with an explanation at these noise scales, in nats, with the price of
+    the numbers that it frees.
+    """
+    return _misfit(plan, what, result, scales) + _price(plan, what)

@@ -6,12 +6,12 @@ old posterior is one more prior, as a full matrix.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import DegenerateError, Pose, SolutionError, attempt, checked, numerical, replace
+from ceres_cal.base import CalibrationError, DegenerateError, Pose, SolutionError, attempt, checked, numerical, replace
 from ceres_cal.calibration import Calibration, RefitRecord
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
@@ -19,6 +19,7 @@ from ceres_cal.moves.explanations import (
     NothingFitsError,
     OtherChangeError,
     Rival,
+    explained_nats,
     judged,
     old_poses,
     require_labels,
@@ -85,21 +86,65 @@ def refit(
         SolutionError: no explanation fits, or one does that `what` does not allow; the message says which.
     """
     plan = make_plan(calibration, observations, what, moved, options)
+
+    def changed(what: str) -> RefitPlan:
+        return make_plan(calibration, observations, what, moved, options)
+
+    # reads: "no explanation fits ...", or that something else has changed, where more noise is less likely
+    found = attempt(partial(_refitted_as_changed, plan, observations, progress, changed), SolutionError)
+    least = _least_nats(plan, found)
+    points, curves = plan.scales
+    likeliest = min((replace(plan, scales=(noise * points, noise * curves)) for noise in NOISES), key=_misfit)
+    if least is not None and likeliest.scales != plan.scales:
+        # quiet: nothing fits at more noise, either, and the answer is what was found before
+        noisier = attempt(partial(_refitted, likeliest, observations, progress))
+        if isinstance(noisier, Calibration) and _nats(plan, plan.what, noisier) < least:
+            times = f"{_noise(plan, noisier):.1f} times as noisy as those of the calibration before"
+            return replace(noisier, remarks=(*noisier.remarks, f"the new observations are {times}"))
+    if isinstance(found, Calibration):
+        return found
+    raise found
+
+
+def _least_nats(plan: RefitPlan, found: Calibration | CalibrationError) -> float | None:
+    """Return how unlikely the observations are by what was found, infinite if nothing was; None where a refusal has
+    nothing to do with noise.
+    """
+    if isinstance(found, Calibration):
+        assert found.refitted is not None
+        return _nats(plan, found.refitted.what, found)
+    if isinstance(found, OtherChangeError) and found.found is not None:
+        return _nats(plan, found.what, found.found)
+    return np.inf if isinstance(found, NothingFitsError) else None
+
+
+def _refitted_as_changed(
+    plan: RefitPlan,
+    observations: Observations,
+    progress: SolveProgress | None,
+    changed: Callable[[str], RefitPlan],
+) -> Calibration:
+    """Return the refit by what has changed, if that was left open."""
     try:
         return _refitted(plan, observations, progress)
     except OtherChangeError as change:  # reads: "the data show that the zoom was changed", or the error
-        if what != "auto" or change.what == "everything":
+        if plan.is_stated or change.what == "everything":
             raise
-        plan = make_plan(calibration, observations, change.what, moved, options)
-        return _refitted(plan, observations, progress, change)
-    except NothingFitsError as nothing:  # reads: "no explanation fits ...", where that holds at more noise, too
-        points, curves = plan.scales
-        every = (replace(plan, scales=(noise * points, noise * curves)) for noise in NOISES[1:])
-        # quiet: nothing fits at more noise, either, and that is what is said
-        found = attempt(partial(_refitted, min(every, key=_misfit), observations, progress))
-        if isinstance(found, Calibration):
-            return found
-        raise nothing from None
+        return _refitted(changed(change.what), observations, progress, change)
+
+
+def _nats(plan: RefitPlan, what: str, result: Calibration) -> float:
+    """Return how unlikely the observations are by a refit, at its own noise, whatever the poses: with more noise more
+    of them explain the observations, in proportion to its power for each of their numbers.
+    """
+    poses = 6.0 * len(plan.moved) * float(np.log(_noise(plan, result)))
+    return explained_nats(plan, what, result, result.fit.scales) - poses
+
+
+def _noise(plan: RefitPlan, result: Calibration) -> float:
+    """Return the noise of a refit relative to the calibration's, of points where there are any."""
+    fit, (points, curves) = result.fit, plan.scales
+    return fit.point_scale / points if fit.points else fit.curve_scale / curves
 
 
 def _misfit(plan: RefitPlan) -> float:
