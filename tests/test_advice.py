@@ -193,7 +193,7 @@ def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None
     ground = Ground(known.estimate, known.posterior.keys, calibration.targets, tolerances, weighting)
     for kind, promise in first_of(advice).items():
         told = ground.information_of(promise.measurement)
-        more = known.posterior.information + (known.posterior.again(told) if kind in AGAIN else told)
+        more = known.posterior.information + (known.posterior.repeated(told) if kind in AGAIN else told)
         there = Uncertainty(
             known.estimate, replace(known.posterior, information=more, mixtures={}), calibration.targets
         )
@@ -282,11 +282,11 @@ def test_more_of_the_same_averages_out_noise_and_not_what_widens() -> None:
     alone = Information(keys, np.linalg.inv(noise)) + stated
     seen = Information(keys, np.linalg.inv(noise + widening)) + stated
     posterior = Posterior(seen, by_model=alone, stated=stated)
-    assert np.allclose(posterior.again(Information.nothing(keys)).matrix, 0.0, atol=1e-12)
-    ten_times = posterior.again(Information(keys, 9.0 * np.linalg.inv(noise)))
+    assert np.allclose(posterior.repeated(Information.nothing(keys)).matrix, 0.0, atol=1e-12)
+    ten_times = posterior.repeated(Information(keys, 9.0 * np.linalg.inv(noise)))
     expected = np.linalg.inv(0.1 * noise + widening) + stated.matrix
     assert np.allclose((seen + ten_times).matrix, expected, rtol=1e-9)
-    assert Posterior(alone).again(alone) is alone
+    assert Posterior(alone).repeated(alone) is alone
 
 
 # ---- which one ------------------------------------------------------------------------------------------------------

@@ -164,7 +164,7 @@ class Posterior(Frozen):
         stated = self.stated.over(self.keys).marginal(information.keys)
         return how(information.less(stated)) + stated
 
-    def again(self, added: Information) -> Information:
+    def repeated(self, added: Information) -> Information:
         """Return what more observations of the same kind add to the information: they average out the noise that varies
         from one to the next, by the model alone, but not what widens the posterior.
 

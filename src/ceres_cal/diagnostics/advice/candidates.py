@@ -128,10 +128,10 @@ class Ground(Frozen):
         )
 
 
-def news(measurement: Measurement, ground: Ground, outlook: Outlook) -> Information:
+def added_information(measurement: Measurement, ground: Ground, outlook: Outlook) -> Information:
     """Return the information that a measurement adds to the posterior; repeated observations only average out noise."""
     told = ground.information_of(measurement)
-    return outlook.posterior.again(told) if measurement.is_seen_again else told
+    return outlook.posterior.repeated(told) if measurement.is_seen_again else told
 
 
 def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:
@@ -184,7 +184,7 @@ class CandidateSearch(Frozen):
     ) -> Iterator[Measurement]:
         """Yield the best ones of a pool, in these counts; each adds most beside those before it."""
         left = list(pool)
-        informations = [news(measurement, self.ground, self.outlook) for measurement in left]
+        informations = [added_information(measurement, self.ground, self.outlook) for measurement in left]
         taken: list[Measurement] = []
         total = Information.nothing(self.ground.keys)
         while left and len(taken) < max(counts):

@@ -12,7 +12,7 @@ from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_
 from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.base.words import short
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, news
+from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, added_information
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Information, Weighting
@@ -108,7 +108,7 @@ def advise(
     ground, outlook = _prepared(calibration, station, height_m)
     search = CandidateSearch(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
     candidates = list(search.candidates())
-    informations = list(each(partial(news, ground=ground, outlook=outlook), candidates, executor=executor))
+    informations = list(each(partial(added_information, ground=ground, outlook=outlook), candidates, executor=executor))
     promises = []
     one_promise = partial(_promise, ground=ground, outlook=outlook)
     for number, promise in enumerate(each(one_promise, candidates, informations, executor=executor), start=1):
@@ -144,7 +144,7 @@ def promised(
         InputError: see `advise`.
     """
     ground, outlook = _prepared(calibration, station, height_m)
-    return tuple(_promise(one, news(one, ground, outlook), ground, outlook) for one in measurements)
+    return tuple(_promise(one, added_information(one, ground, outlook), ground, outlook) for one in measurements)
 
 
 def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
@@ -213,7 +213,7 @@ def _promise(measurement: Measurement, added: Information, ground: Ground, outlo
 def _information_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Information:
     """Return its information if everything were elsewhere: boards are held before the camera, wherever that is."""
     here, other = (e.stations[outlook.today.station].cam_from_world for e in (ground.estimate, there))
-    return news(measurement.before(here, other), replace(ground, estimate=there), outlook)
+    return added_information(measurement.before(here, other), replace(ground, estimate=there), outlook)
 
 
 def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
