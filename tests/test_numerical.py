@@ -75,7 +75,7 @@ def test_a_plane_through_what_nearly_fits_exactly() -> None:
 def test_a_pixel_that_nobody_measured_is_named(pixel: float) -> None:
     pixels = NOISY.points.pixels.copy()
     pixels[3, 1] = pixel
-    with pytest.raises(InputError, match=r"point '.*': pixel \(.*\) lies 10 images away"):
+    with pytest.raises(InputError, match=r"point '.*': pixel \(.*\) lies 10 image diagonals away"):
         calibrate(replace(NOISY, points=replace(NOISY.points, pixels=pixels)), RADIAL)
 
 

@@ -92,10 +92,7 @@ def refit(
 
     # reads: "no explanation fits ...", or that something else has changed, where more noise is less likely
     found = attempt(partial(_refitted_as_changed, plan, observations, progress, changed), SolutionError)
-    least = _least_nats(plan, found)
-    points, curves = plan.scales
-    likeliest = min((replace(plan, scales=(noise * points, noise * curves)) for noise in NOISES), key=_misfit)
-    if least is not None and likeliest.scales != plan.scales:
+    if (least := _least_nats(plan, found)) is not None and (likeliest := _likeliest(plan)) is not plan:
         # quiet: nothing fits at more noise, either, and the answer is what was found before
         noisier = attempt(partial(_refitted, likeliest, observations, progress))
         if isinstance(noisier, Calibration) and _nats(plan, plan.what, noisier) < least:
@@ -107,12 +104,13 @@ def refit(
 
 
 def _least_nats(plan: RefitPlan, found: Calibration | CalibrationError) -> float | None:
-    """Return how unlikely the observations are by what was found, infinite if nothing was; None where a refusal has
-    nothing to do with noise.
+    """Return how unlikely the observations are by what was found, infinite if nothing was; None where more noise would
+    not change that: all observations fit as they are, or a refusal has nothing to do with noise.
     """
     if isinstance(found, Calibration):
         assert found.refitted is not None
-        return _nats(plan, found.refitted.what, found)
+        what, fits = found.refitted.what, not found.outliers and _noise(plan, found) < NOISES[1]
+        return None if fits and what == plan.what else _nats(plan, what, found)
     if isinstance(found, OtherChangeError) and found.found is not None:
         return _nats(plan, found.what, found.found)
     return np.inf if isinstance(found, NothingFitsError) else None
@@ -145,6 +143,13 @@ def _noise(plan: RefitPlan, result: Calibration) -> float:
     """Return the noise of a refit relative to the calibration's, of points where there are any."""
     fit, (points, curves) = result.fit, plan.scales
     return fit.point_scale / points if fit.points else fit.curve_scale / curves
+
+
+def _likeliest(plan: RefitPlan) -> RefitPlan:
+    """Return the plan at the noise that the best poses make most likely."""
+    points, curves = plan.scales
+    noisier = (replace(plan, scales=(noise * points, noise * curves)) for noise in NOISES if noise != 1.0)
+    return min(plan, *noisier, key=_misfit)
 
 
 def _misfit(plan: RefitPlan) -> float:
