@@ -1,7 +1,7 @@
 """The report: one HTML page that says whether a calibration can be trusted, for what, and to how many mm.
 
-This is the only package that imports the plotting library. The page is imported when it is first used: every command
-needs the quality of a calibration, few need the page.
+All pictures are drawn here, except by `plot()` of public objects. The page is imported when it is first used: every
+command needs the quality of a calibration, few need the page.
 """
 
 from ceres_cal.base.frozen import names_of

@@ -1,4 +1,4 @@
-"""SVG pictures in one style; the only module that imports the plotting library.
+"""SVG pictures in one style: the frame of each, and the letters, lines and dots that they share.
 
 A picture is drawn for the width at which it is shown, so that its letters have the size of the page's. Many similar
 parts are drawn as one path (`dots`, `strokes`): thousands of them take a few bytes each and stay sharp in print.

@@ -93,7 +93,7 @@ def quality_of(calibration: Calibration, observations: Observations) -> Quality:
     if not calibration.rounds:
         return Quality(calibration, observations, None)
     few = thinned(observations, diagnosed)
-    # reads: "Its residuals could not be judged, so nothing says whether the model is right: ..."
+    # reads: "Its residuals could not be judged. So it is not known whether the model is right: ..."
     found = attempt(lambda: diagnose(calibration, few, new_data=few is not observations))
     if isinstance(found, CalibrationError):
         return Quality(calibration, observations, None, str(found))

@@ -35,7 +35,7 @@ _PARALLEL, _AS_STRONG = 0.07, 0.5
 # Least number of places found on a curve, and of curves with so many: fewer could be any lines. Nothing changes from
 # half to double.
 _FEWEST_PLACES, _FEWEST_CURVES = 5, 3
-# Least cosine of the tilt: 65 degrees, 20 more than is promised. Nothing changes at half of it; at double, 33 degrees,
+# Least cosine of the tilt: 65 degrees, 10 more than is promised. Nothing changes at half of it; at double, 33 degrees,
 # tilted views are missed.
 _LEAST_UPRIGHT = 0.42
 # Distance, as a share of the extent of what is seen, within which two cameras give it the same names. Nothing changes

@@ -261,7 +261,7 @@ bool find_rows(Tuple optics, const Poses& poses, Tuple columns, const Filled<N, 
     const Given seen(columns, 0, sights, INT32_MAX);
     seen.require_directions();
     require(rows.shape(0) == seen.count() && rows.shape(2) == camera.intrinsics.size() + 6 + BUILT,
-            "rows are (N, residuals, intrinsics + 6 + 7)");
+            "rows are (N, residuals, intrinsics + 6 + 10)");
     require(normals.shape(0) == (many == 1 ? seen.count() : 0), "normals are (M, 2) of curves");
     return each_sight(0, sights, camera, poses, [&](int64_t v, Projection& shown, const double* pose) {
         return rows_of(v, shown, pose, seen.view, rows.data(), normals.data());
