@@ -209,6 +209,22 @@ def test_no_photograph_at_all(tmp_path: Path) -> None:
             call()
 
 
+@pytest.mark.usefixtures("words_alone")
+def test_a_folder_that_holds_nothing_but_a_folder_for_each_camera(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The answer looked for videos in the folder that was given, where there was nothing, and was not printed."""
+    for name, numbers in (("left", "1234"), ("right", "5678")):
+        (tmp_path / "cameras" / name).mkdir(parents=True)
+        for number in numbers:
+            shutil.copy(SAMPLE / "photographs" / f"board_0{number}.jpg", tmp_path / "cameras" / name)
+    asked = ["run", str(tmp_path / "cameras"), "--board", "9x6x100mm", "--lens", "radial"]
+    main([*asked, "-o", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    assert f"8 photographs in {tmp_path / 'cameras'}" in printed and "left/board.json" in printed
+    assert [*Calibration.load(tmp_path / "out" / "calibration.json").cameras] == ["left", "right"]
+
+
 def test_a_folder_without_images_names_those_of_its_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "left").mkdir()
     shutil.copy(PHOTOGRAPH, tmp_path / "left")

@@ -104,7 +104,7 @@ def _run(args: RunArguments) -> Document:
     data = {"images": sum(map(len, images)), "verdict": calibrated.data["verdict"]}
     data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
     made = level != "no" and not any(step.exit_code for step in asked)
-    sections = Section(data=data), *_sections(args, data["images"], steps, level)
+    sections = Section(data=data), *_sections(args, cameras, data["images"], steps, level)
     return Document(sections, 0 if made else 1, data["verdict"]["headline"])
 
 
@@ -273,9 +273,11 @@ def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: formats
 # ---- for people -----------------------------------------------------------------------------------------------------
 
 
-def _sections(args: RunArguments, images: int, steps: Sequence[_Step], level: str) -> Iterator[Section]:
+def _sections(
+    args: RunArguments, cameras: Sequence[RunArguments], images: int, steps: Sequence[_Step], level: str
+) -> Iterator[Section]:
     yield Section("read", [f"{plural(images, 'photograph')} in {first_of(args.images, _MOST_NAMES)}"])
-    yield turned_section(images_and_videos(args.images)[1])
+    yield turned_section(video for one in cameras for video in images_and_videos(one.images)[1])
     for number, step in enumerate(steps, start=1):
         yield _BLANK
         yield Section(f"step {number}", [_short(step.command)])
