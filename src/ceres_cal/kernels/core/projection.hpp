@@ -52,7 +52,7 @@ class Projection {
             place_on_tracks();
             to_camera(pose);
             if (!lens.project(rows.n, rays_, image)) return false;
-            if (find_steps(pose, step > 0) < FOOT_TOLERANCE_PX || step + 1 == FOOT_STEPS) break;  // feet are shown ones
+            if (find_steps(pose, step > 0) < FOOT_TOLERANCE_PX) break;
             each(rows.n, [&](int i) { s_[i] += step_[i]; });
         }
         std::copy_n(s_.value, n, curves.feet + start);
