@@ -214,7 +214,7 @@ def _focal_tile(verdict: Verdict) -> Tile:
 def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
     """Make the chapter of the numbers."""
     intro = (
-        "Coefficients use the paper's notation with a1 = 1. Known: to 1 % or better. Weak: to 30 %. In conflict: all "
+        "Radial lenses use the paper's notation with a1 = 1. Known: to 1 % or better. Weak: to 30 %. In conflict: all "
         "other observations contradict the stated value."
     )
     every = (*number_sections(quality), *accuracy_sections(quality, seams))
