@@ -1,9 +1,10 @@
-"""How fast we are, beside the others and by ourselves: python scripts/benchmark.py [--help]
+"""Speed of calibration, compared with other calibrators and by itself: python scripts/benchmark.py [--help]
 
-First a wide lens (f 600 px, k1 -0.28, k2 0.07, 1280 x 960) from the corners of a checkerboard with 0.3 px of noise,
-solved from a cold start by us, OpenCV, pycolmap and mrcal in turn; then, for us alone, growth with the frames, and with
-the line points that a static camera sees of a field. Ours is everything from Observations to Calibration; of the others
-only the solver counts, though OpenCV's call seeds itself.
+First a wide lens (f 600 px, k1 -0.28, k2 0.07, 1280 x 960) is calibrated from the corners of a checkerboard with 0.3 px
+of noise, without an initial estimate, by ceres-cal, OpenCV, pycolmap and mrcal in turns. Then the growth of our time is
+measured with the number of frames, and with the number of line points that a static camera sees of a field. Our time is
+that from Observations to Calibration; for the others only the solver counts, although OpenCV's call includes its
+initial estimate.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ from ceres_cal.scene.lens import KannalaBrandt
 OURS = "ceres-cal"
 MODULES = {OURS: "ceres_cal.calibration.calibrating", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
-MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
+MIRRORED_DEG = 5.0  # a pose farther from the truth is the mirrored one of a plane
 WARM_UP_LINE_POINTS, WARM_UP_S = 1000, 0.3
 PIXELS, FEW_PIXELS = 1_000_000, 10_000
-LAST_DECADES = 2.0  # over which growth is told
+LAST_DECADES = 2.0  # over which growth is fitted
 
 Solver = Callable[[Corners], Answer]
 
@@ -60,14 +61,14 @@ Solver = Callable[[Corners], Answer]
 
 
 def solve_ours(corners: Corners) -> Answer:
-    """From Observations to Calibration, with the nine intrinsics that OpenCV and mrcal solve for."""
+    """Time and result from Observations to Calibration, with the nine intrinsics that OpenCV and mrcal solve for."""
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.observations.sights import gather_sights
     from ceres_cal.problem.parameters import Options
     from ceres_cal.start.initialise import initialise
 
     options = Options(lens="brown", free_aspect=True)
-    observations = corner_observations(corners)  # new ones each time: they remember what was derived from them
+    observations = corner_observations(corners)  # new ones each time, since they cache what is derived
     start = time.perf_counter()
     calibration = calibrate(observations, options)
     seconds = time.perf_counter() - start
@@ -86,7 +87,7 @@ def solve_ours(corners: Corners) -> Answer:
 
 
 def solve_apart(name: str, warm_up_s: float, corners: Corners) -> tuple[Answer, float]:
-    """A peer's answer from a process of its own, and that process' peak memory in MiB."""
+    """A peer's answer from a process of its own, and the peak memory of that process in MiB."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "corners.npz"
         corners.save(path)
@@ -97,12 +98,12 @@ def solve_apart(name: str, warm_up_s: float, corners: Corners) -> tuple[Answer, 
 
 
 def answer_apart(name: str, warm_up_s: float, corners: Corners) -> Answer:
-    """The answer alone."""
+    """A peer's answer from a process of its own."""
     return solve_apart(name, warm_up_s, corners)[0]
 
 
 def run(name: str, *arguments: str) -> str:
-    """What the Python of a solver prints; another than this must not find this one's packages."""
+    """Output of a solver's Python; a Python other than this one must not find this one's packages."""
     strange = python_of(name) != sys.executable
     variables = {k: v for k, v in os.environ.items() if k != OURS_ALONE and not (strange and k.startswith("PYTHON"))}
     command = [python_of(name), *arguments]
@@ -118,7 +119,7 @@ def python_of(name: str) -> str:
 
 
 def import_seconds(name: str, repeat: int) -> float | None:
-    """Median time of its import in a fresh process, after a first one where several are asked; None without it."""
+    """Median time of its import in a fresh process, with an extra first run unless repeat is 1; None without it."""
     code = f"import time; start = time.perf_counter(); import {MODULES[name]}; print(time.perf_counter() - start)"
     try:
         times = [float(run(name, "-c", code)) for _ in range(repeat + (repeat > 1))]
@@ -131,7 +132,7 @@ def import_seconds(name: str, repeat: int) -> float | None:
 
 
 def judge(problem: Problem, answer: Answer) -> dict[str, Any]:
-    """The same for all: rms over every corner, error of the focal length, number of mirrored frames."""
+    """The same for all solvers: rms over every corner, error of the focal length, number of mirrored frames."""
     import cv2
 
     corners, pose = problem.corners, answer.cam_from_board[problem.corners.view]
@@ -148,7 +149,7 @@ def judge(problem: Problem, answer: Answer) -> dict[str, Any]:
 
 
 def compare(frames: int, solvers: Mapping[str, Solver], repeat: int) -> dict[str, Any]:
-    """All solvers on one problem, taking turns: medians, and ratios within each turn."""
+    """All solvers on one problem in turns: medians, and ratios within each turn."""
     problem = wide_lens(frames)
     turns = [{name: solve(problem.corners) for name, solve in solvers.items()} for _ in range(repeat)]
     rows: dict[str, dict[str, Any]] = {}
@@ -174,7 +175,7 @@ def compare(frames: int, solvers: Mapping[str, Solver], repeat: int) -> dict[str
 
 
 def add_memory(found: dict[str, Any]) -> None:
-    """Peak memory of each solver, each in a process of its own."""
+    """Peak memory of each solver in a process of its own."""
     corners = wide_lens(found["frames"]).corners
     for name, row in found["solvers"].items():
         row["peak_mib"] = alone("corners", found["frames"]) if name == OURS else solve_apart(name, 0.0, corners)[1]
@@ -184,12 +185,12 @@ def add_memory(found: dict[str, Any]) -> None:
 
 
 def alone(task: str, size: int, repeat: int = 1) -> Any:
-    """The answer of one of the tasks below from a process of its own."""
+    """The result of one of the tasks below from a process of its own."""
     return json.loads(run(OURS, __file__, "--alone", task, str(size), str(repeat)))
 
 
 def first_call(frames: int, repeat: int) -> float:
-    """Seconds that the first calibration of a process takes longer than later ones: it loads the compiled kernels."""
+    """Additional seconds of the first calibration of a process, which loads the compiled kernels."""
     corners = wide_lens(frames).corners
     first, *later = (solve_ours(corners).seconds for _ in range(repeat + 1))
     return first - median(later)
@@ -203,7 +204,7 @@ def corners_memory(frames: int, repeat: int) -> float:
 
 
 def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
-    """Seconds of calibrate (median) and the memory that the process holds at most meanwhile, observations included."""
+    """Seconds of calibrate (median), and the peak memory of the process meanwhile, observations included."""
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.problem.parameters import Options
 
@@ -212,7 +213,7 @@ def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
     reset_peak()
     seconds = []
     for _ in range(repeat):
-        fresh = replace(observations)  # forgets what was derived from it
+        fresh = replace(observations)  # without cached results
         start = time.perf_counter()
         calibration = calibrate(fresh, Options(lens="radial"))
         seconds.append(time.perf_counter() - start)
@@ -238,7 +239,7 @@ TASKS: dict[str, Callable[[int, int], Any]] = {
 
 
 def uncertainty_share(frames: int, repeat: int) -> float:
-    """What the standard deviations of everything, placements too, add to a calibration's seconds (median of turns)."""
+    """Time of all standard deviations, placements included, over the time of a calibration without them (median)."""
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.effects.dependence import measure_scatter
     from ceres_cal.observations.sights import gather_sights
@@ -256,21 +257,21 @@ def uncertainty_share(frames: int, repeat: int) -> float:
         calibration = calibrate(observations, options)
         calibrated = time.perf_counter() - start
         estimate, there = calibration.estimate, residuals(sights, calibration.estimate)
-        assert len(there.lengths[0])  # calibrate() has them at hand
+        assert len(there.lengths[0])  # calibrate() has computed them already
         start = time.perf_counter()
         whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
         reduced, scatter_at = information(whole, estimate), partial(measure_scatter, whole, there)
         _, posterior = assess(whole, estimate, reduced, np.inf, scatter_at)
         assessed = time.perf_counter() - start
-        known = len(posterior.placements)  # works them all out
+        known = len(posterior.placements)  # computes all of them
         everything = time.perf_counter() - start
         assert known == frames
-        shares.append(everything / (calibrated - assessed))  # calibrate() assesses what is shared
+        shares.append(everything / (calibrated - assessed))  # calibrate() includes the uncertainty of what is shared
     return median(shares)
 
 
 def frames_growth(frames: int, repeat: int) -> dict[str, Any]:
-    """Our seconds on the wide lens."""
+    """Our seconds for the wide lens."""
     problem = wide_lens(frames)
     answers = [solve_warm(solve_ours, WARM_UP_S, problem.corners) for _ in range(repeat)]
     seconds = median(answer.seconds for answer in answers)
@@ -278,7 +279,7 @@ def frames_growth(frames: int, repeat: int) -> dict[str, Any]:
 
 
 def exponent(rows: Sequence[Mapping[str, float]]) -> float | None:
-    """Slope of log seconds over log size in the last decades; None where there is a single size."""
+    """Slope of log seconds over log size in the last decades; None for a single size."""
     size, seconds = (np.log10([row[name] for row in rows]) for name in ("size", "seconds"))
     last = size >= size[-1] - LAST_DECADES - 1e-9
     return float(np.polyfit(size[last], seconds[last], 1)[0]) if np.sum(last) > 1 else None
@@ -385,7 +386,7 @@ PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": (
 
 
 def print_table(title: str, columns: Mapping[str, tuple[str, str]], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Rows by key; columns: key -> head and format. What a row does not have is a dash."""
+    """Rows by key; columns: key -> head and format. A missing value is printed as a dash."""
     lines = [[head for head, _ in columns.values()]]
     for row in rows:
         values = [(row.get(key), form) for key, (_, form) in columns.items()]
@@ -398,7 +399,7 @@ def print_table(title: str, columns: Mapping[str, tuple[str, str]], rows: Iterab
 
 
 def pixel_rows(repeat: int, count: int) -> list[dict[str, Any]]:
-    """Seconds that so many pixels take to the floor at robot height and back, for a lens of each kind."""
+    """Seconds to locate so many pixels at robot height and to project them back, for a lens of each kind."""
     camera = replace(OVERHEAD, phi=600.0).at(overhead_pose(0.0, 0.0, HEIGHT_M, tilt_x_deg=TILT_DEG))
     pixels = np.random.default_rng(0).uniform((0.0, 0.0), camera.image_size, (count, 2))
     rows = []
@@ -428,7 +429,7 @@ def print_growth(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         print(f"  seconds grow as the number to the power {slope:.3f} (last {LAST_DECADES:.0f} decades)")
 
 
-# ---- the whole ------------------------------------------------------------------------------------------------------
+# ---- measurements ---------------------------------------------------------------------------------------------------
 
 
 def environment() -> dict[str, Any]:
@@ -443,7 +444,7 @@ def environment() -> dict[str, Any]:
 
 
 def measure(chosen: argparse.Namespace) -> dict[str, Any]:
-    """Everything asked for, printed as it comes."""
+    """Measures everything that was chosen, and prints it immediately."""
     report: dict[str, Any] = {"environment": environment()}
     print(", ".join(f"{name} {value}" for name, value in report["environment"].items()))
     print("each solver takes as many threads as it does by itself; pycolmap's num_threads is -1: all")
@@ -474,7 +475,7 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
 
 
 def measure_scale(chosen: argparse.Namespace) -> dict[str, Any]:
-    """Line points in files, in one process and with Dask's workers; frames; and how they grow."""
+    """Line points in files, in one process and with Dask's workers; frames; and the growth with their number."""
     rows: list[dict[str, Any]] = []
     for count in chosen.scale:
         with folder_for(count) as folder:
@@ -498,14 +499,14 @@ def measure_scale(chosen: argparse.Namespace) -> dict[str, Any]:
 
 
 def measure_processes(repeat: int) -> dict[str, Any]:
-    """From start to exit, printed."""
+    """Whole processes, printed."""
     rows = process_rows(repeat)
     print_table(f"from start to exit, median of {repeat} turns; ratio: how many times OpenCV's", PROCESS, rows)
     return {"environment": environment(), "process": rows}
 
 
 def measure_photographs(repeat: int, fields: bool) -> dict[str, Any]:
-    """From photographs of boards to a calibration beside OpenCV, and fields, printed."""
+    """Photographs of boards to a calibration, compared with OpenCV, and photographs of fields; printed."""
     rows = photograph_rows(repeat)
     print_table(f"from photographs to a calibration, whole processes, median of {repeat} turns", PHOTOGRAPHS, rows)
     found = field_rows() if fields else []
@@ -514,14 +515,14 @@ def measure_photographs(repeat: int, fields: bool) -> dict[str, Any]:
 
 
 def measure_lenses(chosen: argparse.Namespace) -> dict[str, Any]:
-    """A lens by its name beside another one and beside the choice of it, printed."""
+    """A lens by its name, compared with another one and with the automatic choice; printed."""
     rows = lens_rows(chosen.frames, chosen.repeat, chosen.warm_up)
     print_table(f"the wide lens by lens, median of {chosen.repeat} turns, and of ratios within each", LENSES, rows)
     return {"environment": environment(), "lenses": rows}
 
 
 def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None]) -> list[dict[str, Any]]:
-    """Every size of the comparison, by the solvers that are there."""
+    """Every size of the comparison, by the solvers that are installed."""
     warm_up_s = chosen.warm_up
     solvers: dict[str, Solver] = {OURS: partial(solve_warm, solve_ours, warm_up_s)}
     for name in (name for name in chosen.peers if imports[name] is not None):
@@ -542,7 +543,7 @@ def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None])
 
 
 def numbers(text: str) -> list[int]:
-    """Of a list with commas: 20,1e3 is [20, 1000]."""
+    """A list with commas: 20,1e3 is [20, 1000]."""
     return sorted(int(float(part)) for part in text.split(",") if part)
 
 

@@ -1,4 +1,4 @@
-"""What mkdocs adds to the book: the help of every command, as the command prints it (mkdocs.yml, hooks)."""
+"""Hook of mkdocs for the book: adds the help of every command, as the command prints it (mkdocs.yml, hooks)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WIDTH = 96
 
 
 def help_of(name: str) -> str:
-    """What `ceres-cal NAME --help` prints, in lines of WIDTH letters."""
+    """Output of `ceres-cal NAME --help` in lines of WIDTH letters."""
     from ceres_cal.cli import main
 
     os.environ["COLUMNS"] = str(WIDTH)

@@ -1,9 +1,9 @@
-"""What the constants that decide something decide: python scripts/constants.py [--help]
+"""Effects of the constants that decide something: python scripts/constants.py [--help]
 
-Each is halved and doubled (a share of one half and more by its odds, a whole number to the nearest one), and small,
-fast scenes are measured again: false alarms and findings of `diagnose`, refusals, boards mirrored or lost, the error
-over the Cramer-Rao bound, false alarms and power of `check`, moves refitted, fields, boards and rings found. One
-row for each constant and factor says which figures change; "nothing" where none does in the digits shown.
+Each constant is halved and doubled (a share of one half or more by its odds, a whole number to the nearest one), and
+small, fast scenes are measured again: false alarms and findings of `diagnose`, refusals, boards mirrored or lost, the
+error over the Cramer-Rao bound, false alarms and power of `check`, moves refitted, fields, boards and rings found. One
+row for each constant and factor lists the figures that change; "nothing" where none changes in the digits shown.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Constant:
     """A constant that decides something.
 
     Attributes:
-        module: below `ceres_cal`. name: there; "Class.field" for a default of a dataclass,
-            "PRIOR.field" for a prior. figures: what it may touch.
+        module: below `ceres_cal`. name: in the module; "Class.field" for a default of a dataclass, "PRIOR.field" for a
+            prior. figures: those that it may change.
     """
 
     module: str
@@ -55,7 +55,7 @@ class Constant:
         return value
 
     def set(self, value: Value) -> None:
-        """Change it for this process, where others have copied it too."""
+        """Sets the value in this process, also in modules that have imported a copy."""
         owner, old = importlib.import_module(f"ceres_cal.{self.module}"), self.value
         if "." in self.name:
             cls, field = self.name.split(".")
@@ -178,11 +178,11 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.photographs.search", "_SURE _AS_GOOD", "auto"),
     *_of("detect.photographs.upright", "_USUAL_TILT _PRIOR_WEIGHT _LEAST_SHARE _LEAST_OF_OWN _APART", "auto"),
 )  # fmt: skip
-"""Those that say what is an outlier, a lost board, a competing pose, a move, a finding, a found field and the like."""
+"""Constants that decide what is an outlier, a lost board, a competing pose, a move, a finding, a found field etc."""
 
 
 def scaled(value: Value, factor: float) -> Value:
-    """The value times the factor; a share from one half on by its odds, a whole number rounded, at least 1."""
+    """The value times the factor; a share of one half or more by its odds; a whole number rounded, at least 1."""
     if isinstance(value, tuple):
         return tuple(factor * part for part in value)
     if isinstance(value, int):
@@ -199,7 +199,7 @@ def scaled(value: Value, factor: float) -> Value:
 def measured(
     figures: str, runs: int, folder: Path, constant: Constant | None = None, value: Value = 0
 ) -> dict[str, str]:
-    """The figures, as they are printed, with a constant set to another value in a process of its own."""
+    """The figures as printed, measured in a new process with a constant set to another value."""
     setting = [] if constant is None else ["--set", str(constant), json.dumps(value)]
     command = [sys.executable, __file__, "--measure", figures, str(folder), "--runs", str(runs), *setting]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -211,7 +211,7 @@ def measured(
 
 
 def changes(now: dict[str, str], then: dict[str, str]) -> str:
-    """What is different, in words."""
+    """The figures that differ."""
     if "error" in then:
         return then["error"]
     found = [f"{name} {now.get(name)} -> {then[name]}" for name in then if then[name] != now.get(name)]
@@ -219,7 +219,7 @@ def changes(now: dict[str, str], then: dict[str, str]) -> str:
 
 
 def rows(chosen: Sequence[Constant], runs: int, folder: Path) -> Iterator[tuple[str, str, str, str]]:
-    """Constant, value, what it is set to, what changes; two for each constant, after what is measured as it is."""
+    """Constant, value, new value, changes; two rows for each constant, after one for the unchanged constants."""
     now: dict[str, dict[str, str]] = {}
     for constant in chosen:
         for name in constant.figures:
@@ -239,7 +239,7 @@ def short(value: Value) -> str:
 
 def _measure(figures: str, folder: Path, runs: int, setting: Sequence[str] | None) -> int:
     """In the process that `measured` starts: set the constant, then measure; the last line printed is the answer."""
-    from accuracy.constants_figures import FIGURES  # with it, everything that copies constants
+    from accuracy.constants_figures import FIGURES  # this also imports all modules that copy constants
 
     if setting is not None:
         constant = next(one for one in DECIDING if str(one) == setting[0])

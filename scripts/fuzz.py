@@ -1,12 +1,12 @@
-"""Odd input before every command: scripts/fuzz.py [--runs N | --minutes N] [--seed N] [--keep FOLDER]
+"""Odd input for every command: scripts/fuzz.py [--runs N | --minutes N] [--seed N] [--keep FOLDER]
 
-Commands over a small corpus, made of what the package ships, are run whole with changes of every kind: numbers, types,
-sizes, names and order in JSON, columns, text and pictures; damaged bytes; exchanged, missing and odd files; words and
-options of the command line (scripts/faults/). A command must answer, or refuse in
-one line with a documented exit code; what it writes must be whole, and be read again. Counted as failures: any other
-exception, warnings, more than a line, half-written files, over 20 s of processor time or 300 s on the wall, over 2 GiB
-more than before, and deaths of the process. Exits with 1 when there is one; --keep keeps the folders that did it.
-Run N of a seed is the same whatever runs beside it: --only N repeats it alone.
+Commands run with a small corpus, made from the package's own data, with changes of every kind: numbers, types, sizes,
+names and order in JSON, columns, text and pictures; damaged bytes; exchanged, missing and odd files; words and options
+of the command line (scripts/faults/). A command must answer, or refuse in one line with a documented exit code. What it
+writes must be complete and readable. Failures are: any other exception, warnings, more than one line, incomplete files,
+over 20 s of processor time or 300 s elapsed, over 2 GiB of additional memory, and a crash of the process. Exits with 1
+when there is one; --keep keeps the folders of failures. Run N of a seed does not depend on other runs: --only N repeats
+it alone.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ import ceres_cal
 from ceres_cal.base.errors import CalibrationError
 
 LONGEST_S, LONGEST_WAIT_S, MOST_MB = 20, 300, 2048
-TOGETHER = 20  # commands of one child: a fork takes as long as a short one
+TOGETHER = 20  # commands of one child, since a fork costs as much as a short command
 EXIT_CODES = {0, 1, 2, 3}
-TRACE = "where.txt"  # a process that took too long was
+TRACE = "where.txt"  # where a process was that took too long
 FAILURES = ("unexpected", "warning", "half written", "many lines", "exit code", "slow", "died", "memory")
-_KEPT = 3  # of each failure
+_KEPT = 3  # failures of each kind
 _SAID_EVERY = 200
 
 
 class Outcome(NamedTuple):
-    """What a command came to, and in which words; where, of an exception, is its place in the package."""
+    """Outcome of a command, its message, and, for an exception, its place in the package."""
 
     what: str
     words: str
@@ -64,7 +64,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(case: Case, place: Path) -> Outcome:
-    """Run a command in its folder and look at what it says and leaves."""
+    """Run a command in its folder, and judge its output and its files."""
     out, err = io.StringIO(), io.StringIO()
     before = set(place.rglob("*"))
     with redirect_stdout(out), redirect_stderr(err):
@@ -72,7 +72,7 @@ def outcome(case: Case, place: Path) -> Outcome:
             with warnings.catch_warnings(record=True) as heard:
                 warnings.simplefilter("always")
                 code = case.run()
-        except CalibrationError as error:  # of Python's own: the others are words by then
+        except CalibrationError as error:  # only for programs in Python: commands print these errors
             code = error.exit_code
             print(f"ceres-cal: {error}", file=err)
         except MemoryError as error:
@@ -97,13 +97,13 @@ def outcome(case: Case, place: Path) -> Outcome:
 
 
 def _place_of(error: BaseException) -> str:
-    """Where in the package, from the inside out."""
+    """Places in the package, the innermost first."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "ceres_cal" in f.filename]
     return " < ".join(f"{Path(f.filename).name}:{f.lineno}" for f in reversed(frames[-4:]))
 
 
 def _half_written(place: Path, before: set[Path]) -> str:
-    """What is wrong with a file that was not there before; nothing where all are whole."""
+    """What is wrong with a new file; "" where all are complete."""
     for path in sorted(set(place.rglob("*")) - before):
         if path.name.endswith(".part") or (path.is_file() and path.stat().st_size == 0):
             return f"{path.name} is left"
@@ -125,22 +125,22 @@ def _half_written(place: Path, before: set[Path]) -> str:
 
 
 def work(folder: Path, seed: int, numbers: Sequence[int], answers: Any) -> None:
-    """The runs of these numbers; each answer is (number, name, outcome, seconds, MB)."""
-    os.setpgid(0, 0)  # whoever ends this one ends its children
+    """Runs these numbers; each answer is (number, name, outcome, seconds, MB)."""
+    os.setpgid(0, 0)  # so that its children can be ended with it
     for descriptor in (1, 2):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)  # what libraries say
-    os.environ["CERES_CAL_DEBUG"] = "1"  # raises what would be one line that begins with "unexpected"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)  # output of libraries
+    os.environ["CERES_CAL_DEBUG"] = "1"  # unexpected errors are raised, not printed
     trace = (folder / TRACE).open("w")
     for told in (signal.SIGUSR1, signal.SIGPROF):
         faulthandler.register(told, trace, all_threads=True, chain=True)
     place = Path(tempfile.mkdtemp(dir=folder, prefix="run"))
     os.chdir(place)
-    before_mb = _peak_mb()  # a fork begins with what its parent has
+    before_mb = _peak_mb()  # a fork starts with its parent's peak
     for number in numbers:
         _emptied(place)
         case = make_case(folder / "good", place, _rng(seed, number))
         answers.send((number, case.name, Outcome("begun", _line_of(case)), 0.0, 0.0))
-        signal.setitimer(signal.ITIMER_PROF, LONGEST_S + 5)  # ends this process, even in native code
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_S + 5)  # ends this process, even within native code
         begin = time.process_time()
         found = outcome(case, place)
         seconds = time.process_time() - begin
@@ -151,7 +151,7 @@ def work(folder: Path, seed: int, numbers: Sequence[int], answers: Any) -> None:
         elif seconds > LONGEST_S:
             found = found._replace(what="slow")
         answers.send((number, case.name, found, seconds, peak_mb))
-        if peak_mb > MOST_MB / 4:  # whose peak would be that of all that follow
+        if peak_mb > MOST_MB / 4:  # the peak of all later runs would be at least this
             return
 
 
@@ -175,19 +175,19 @@ def _rng(seed: int, number: int) -> np.random.Generator:
     return np.random.default_rng((seed, number))
 
 
-# ---- all of them ----------------------------------------------------------------------------------------------------
+# ---- all runs -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Goal:
-    """So many runs of a seed, or until a time of the clock."""
+    """Which runs of a seed, and until what time."""
 
     numbers: range
     end: float = math.inf
 
 
 class Counts(Counter[tuple[str, str]]):
-    """How often each command came to each outcome; and each failure by where it is."""
+    """How often each command had each outcome; and each failure by its place."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -195,7 +195,7 @@ class Counts(Counter[tuple[str, str]]):
         self.slowest_s = self.peak_mb = 0.0
 
     def add(self, name: str, found: Outcome, seconds: float, megabytes: float) -> int:
-        """Count it; of a failure, how many of its kind there are."""
+        """Counts it; returns, for a failure, how many of its kind there are."""
         self[name, found.what] += 1
         self.slowest_s, self.peak_mb = max(self.slowest_s, seconds), max(self.peak_mb, megabytes)
         if found.what not in FAILURES:
@@ -206,7 +206,7 @@ class Counts(Counter[tuple[str, str]]):
 
 
 def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None = None) -> Counts:
-    """Run what the goal says over the corpus in folder/good."""
+    """Run all numbers of the goal with the corpus in folder/good."""
     counts, left = Counts(), goal.numbers
     context = multiprocessing.get_context("fork")
     while left and time.time() < goal.end:
@@ -226,7 +226,7 @@ def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None = None) -> Count
 
 
 def _answers(worker: Any, answers: Any, folder: Path) -> Iterator[tuple[int, str, Outcome, float, float]]:
-    """What a child says of each of its runs, and what is to be said of it where it died in one."""
+    """The results of a child, including a result for a run in which it died."""
     begun: tuple[int, str] | None = None
     with suppress(EOFError):
         while answers.poll(LONGEST_WAIT_S) or _ended(worker):
@@ -250,7 +250,7 @@ def _last(line: str) -> str:
 
 
 def _ended(worker: Any) -> bool:
-    """End a child that says nothing any more, and its children: its trace first. True: all that it said is there."""
+    """End a child that no longer answers, and its children, after its trace is written. True: all it sent is there."""
     with suppress(ProcessLookupError):
         os.kill(worker.pid, signal.SIGUSR1)
         worker.join(2.0)
@@ -259,7 +259,7 @@ def _ended(worker: Any) -> bool:
 
 
 def put_aside(folder: Path, keep: Path | None, found: Outcome, seed: int, number: int) -> str:
-    """Make a run's folder once more, to be kept; its words."""
+    """Make a run's folder again, to be kept; returns its command line."""
     place = Path(tempfile.mkdtemp(dir=folder))
     if keep is not None:
         place = keep / f"{found.what} {seed} {number}".replace(" ", "-")
@@ -273,7 +273,7 @@ def put_aside(folder: Path, keep: Path | None, found: Outcome, seed: int, number
 
 
 def prepare(folder: Path) -> Path:
-    """The corpus in folder/good, and all of the package imported: forks have it, and the kernels."""
+    """Make the corpus in folder/good, and import the whole package, so that forks share it and the kernels."""
     for module in pkgutil.walk_packages(ceres_cal.__path__, "ceres_cal."):
         importlib.import_module(module.name)
     (folder / "good").mkdir()

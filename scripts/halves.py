@@ -1,13 +1,13 @@
 """Whether random halves of the views agree as stated, on real photographs: python scripts/halves.py [--help]
 
-Each half is calibrated by itself. What the two differ by, over the standard deviation that both together state: of the
-intrinsics (Mahalanobis length over the square root of their number) and of where rays are seen over the part of the
-image that the views fill (root mean square over a grid, the rotation that fits best taken out, for nothing says which
-way a camera frame looks; "in plane" the pose of a plane that faces the camera is taken out instead, as a board's is, or
-that of a floor). All are 1 where the statement is honest. "By defaults" each half chooses its lens, too. Each
-set stands beside its control: the same views as the calibration of the whole set sees them, with independent normal
-noise of the size that it found. Exits with 1 when a figure is missed by more than two of its standard errors; the
-folder of real sets is $CERES_CAL_REAL, or shared/real beside the repository.
+Each half is calibrated separately. The difference of the two is divided by the standard deviation that both together
+state: for the intrinsics (Mahalanobis length over the square root of their number) and for the projections of rays over
+the part of the image that the views fill (root mean square over a grid). For projections the best-fitting rotation is
+removed, since the orientation of a camera frame is not determined. For "in plane" the pose of a plane that faces the
+camera is removed instead, as for a board or a floor. All are 1 where the statement is honest. "By defaults" each half
+also chooses its lens. Each set has a control: the same views as the calibration of the whole set predicts them, with
+independent normal noise of the estimated size. Exits with 1 when a figure is missed by more than two standard errors;
+the folder of real sets is $CERES_CAL_REAL, or shared/real beside the repository.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1
 _GRID = 12  # places along the longer side of the image
 _STEP = 1e-5  # of each number's natural size
-_LEAST_AHEAD = 0.17  # cosine of the angle off the axis up to which a plane before the camera is looked at
+_LEAST_AHEAD = 0.17  # cosine of the largest angle from the axis at which a plane is evaluated
 
 
 # ---- the sets -------------------------------------------------------------------------------------------------------
@@ -50,7 +50,7 @@ _LEAST_AHEAD = 0.17  # cosine of the angle off the axis up to which a plane befo
 
 @dataclass(frozen=True)
 class RealSet:
-    """One camera's views of a board, and how they are calibrated."""
+    """One camera's views of a board, and the options of their calibration."""
 
     observations: Callable[[], Observations]
     options: Options
@@ -74,7 +74,7 @@ SETS |= {f"{name}{_DEFAULTS}": replace(one, options=Options()) for name, one in 
 
 
 def control(calibration: Calibration, observations: Observations, seed: int) -> Observations:
-    """The same views of the same points as the calibration sees them, with independent normal noise."""
+    """The same views of the same points as the calibration predicts them, with independent normal noise."""
     points, pixels = observations.points, np.empty_like(observations.points.pixels)
     for number, view in enumerate(observations.views):
         own = points.view == number
@@ -89,7 +89,7 @@ def control(calibration: Calibration, observations: Observations, seed: int) -> 
 
 
 def halves(observations: Observations, seed: int) -> tuple[Observations, Observations]:
-    """The views split at random into two halves, as nearly as may be."""
+    """The views split at random into two halves whose sizes differ by at most one."""
     count = len(observations.views)
     first = np.isin(np.arange(count), np.random.default_rng(seed).permutation(count)[: count // 2])
     return _of_views(observations, first), _of_views(observations, ~first)
@@ -100,16 +100,16 @@ def _of_views(observations: Observations, chosen: Mask) -> Observations:
 
 
 def _of_rows(points: Points, rows: Mask, observations: Observations) -> Observations:
-    """The observations with some rows of these points in place of their own."""
+    """The observations with only these rows of the given points."""
     return replace(observations, points=taken(points, rows))
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two calibrations of one camera lie apart, over what they state: 1 on average where both are honest.
+    """Difference of two calibrations of one camera over what they state: 1 on average where both are honest.
 
     Attributes:
-        intrinsics, projections, in_plane: see the script's own words; mean squares, not yet their roots.
+        intrinsics, projections, in_plane: see the module's docstring; mean squares, not their roots.
     """
 
     intrinsics: float
@@ -118,9 +118,8 @@ class Agreement:
 
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
-    """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of lenses
-    of two kinds the intrinsics do not mean the same: NaN; of one kind with other knots, or others free, coefficients
-    do not, and are left out.
+    """Agreement of two calibrations with one camera each; projections at pixels (N, 2). For lenses of two kinds the
+    intrinsics have different meanings: NaN. Coefficients of one kind with other knots or other free terms are left out.
     """
     posteriors = [one.uncertainty.posterior for one in (first, second)]
     keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]
@@ -152,13 +151,13 @@ def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreeme
 
 
 def _meaning(lens: Lens) -> tuple[object, ...]:
-    """What its numbers mean."""
+    """What determines the meaning of a lens's numbers."""
     return lens.kind, lens.names, *(lens.coefficients.get(name) for name in lens.set_at_start)
 
 
 def stated_squares(calibration: Calibration, camera: Camera, rays: Array, turned: Array) -> Array:
-    """(2 N,) variance, px^2, of where rays (N, 3) are seen as the calibration of the camera states it, all turns of a
-    basis (2 N, 3) taken out.
+    """(2 N,) stated variance, px^2, of the projections of rays (N, 3), after the rotations of a basis (2 N, 3) are
+    projected out.
     """
     posterior = calibration.uncertainty.posterior
     own = [key for key in posterior.keys if key.kind == "camera"]
@@ -174,12 +173,12 @@ def _covariance(posterior: Posterior, keys: Sequence[Key]) -> Array:
 
 
 def pairs(values: Array) -> Array:
-    """(N,) sums over x and y of (2 N,)."""
+    """(N,) sums over x and y of values (2 N,)."""
     return np.asarray(values.reshape(-1, 2).sum(axis=1))
 
 
 def seen_grid(observations: Observations) -> Array:
-    """(N, 2) a grid of pixels over the part of the image that the observed points of all views enclose."""
+    """(N, 2) a grid of pixels in the convex hull of the observed points of all views."""
     ((width, height),) = observations.cameras.values()
     step = max(width, height) / _GRID
     x, y = (np.arange(0.5 * step, size, step) for size in (width, height))
@@ -189,7 +188,7 @@ def seen_grid(observations: Observations) -> Array:
 
 
 def _projection_slopes(camera: Camera, rays: Array, quantities: Sequence[str], steps: Array) -> Array:
-    """(2 N, K) px by which rays (N, 3) are seen elsewhere, per unit of each intrinsic."""
+    """(2 N, K) derivatives of the projections of rays (N, 3), px per unit of each intrinsic."""
     columns = []
     for number, size in enumerate(steps):
         step = np.array([size])
@@ -199,7 +198,7 @@ def _projection_slopes(camera: Camera, rays: Array, quantities: Sequence[str], s
 
 
 def turn_basis(camera: Camera, rays: Array) -> Array:
-    """(2 N, 3) orthonormal basis of how the places at which rays (N, 3) are seen move when the camera turns."""
+    """(2 N, 3) orthonormal basis of the displacements of projected rays (N, 3) under rotations of the camera."""
     ahead, behind = (
         [camera.project(rays + sign * _STEP * rays @ skew(axis)) for axis in np.eye(3)] for sign in (1, -1)
     )
@@ -207,7 +206,7 @@ def turn_basis(camera: Camera, rays: Array) -> Array:
 
 
 def pose_basis(camera: Camera, rays: Array) -> Array:
-    """(2 N, 6) the same when a plane that faces the camera, on which the rays (N, 3) end, is moved and turned."""
+    """(2 N, 6) the same for motions of a plane that faces the camera, on which the rays (N, 3) end."""
     places, columns = rays / rays[:, 2:], []
     for axis in np.eye(3):
         for step in (np.broadcast_to(axis, places.shape), places @ skew(axis)):

@@ -1,7 +1,7 @@
 """The figures that a change must not make worse, in one table: python scripts/outcomes.py [--help]
 
 Runs the commands that measure them, one after the other, and prints one row for each key figure. `-o` stores all
-figures as JSON; `--against` compares with a stored table and marks what differs beyond its sampling error. `--checkout`
+figures as JSON. `--against` compares with a stored table and marks differences beyond the sampling error. `--checkout`
 measures another checkout of the repository with its own Python and its own scripts. Exits with 1 when a command gives
 no figures, or when a figure differs from the stored one.
 """
@@ -25,8 +25,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_ERRORS = 2.0  # standard errors of a difference: one figure in twenty is marked by chance
-ALIKE = 0.05  # relative: of figures without a standard error, which are times, and answers to a single photograph
-NONE_YET = 1.0  # the standard error of a count of 0, which a Poisson count of 1 has
+ALIKE = 0.05  # relative, for figures without a standard error: times, and results of a single photograph
+NONE_YET = 1.0  # standard error of a count of 0, equal to that of a Poisson count of 1
 SHARED = {"CERES_CAL_REAL": "shared/real", "CERES_CAL_SHARED": "shared"}  # beside the repository
 
 # ---- figures --------------------------------------------------------------------------------------------------------
@@ -37,8 +37,8 @@ class Figure:
     """One figure of a command.
 
     Attributes:
-        error: its standard error, 0 where it has none. verdict: "no" where the command says that it is missed.
-        key: whether the table has it always, or only where it differs. seconds: what the whole command took.
+        error: its standard error, 0 where it has none. verdict: "no" where the command reports that it is missed.
+        key: whether the table always shows it, or only where it differs. seconds: time of the whole command.
     """
 
     command: str
@@ -50,7 +50,7 @@ class Figure:
     seconds: float = 0.0
 
     def differs(self, old: Figure) -> str:
-        """How it differs from a stored one: a mark, or nothing."""
+        """The kind of difference from a stored figure, "" for none."""
         if old.verdict in ("yes", "open") and self.verdict == "no":
             return "missed now"
         if self.value == old.value or (math.isnan(self.value) and math.isnan(old.value)):
@@ -67,13 +67,13 @@ def _count(command: str, name: str, count: float, most: float = math.inf) -> Fig
     return Figure(command, name, count, math.sqrt(max(count, NONE_YET)), verdict)
 
 
-# ---- what commands print --------------------------------------------------------------------------------------------
+# ---- parsers of outputs ---------------------------------------------------------------------------------------------
 
 Parser = Callable[[str, str], Iterator[Figure]]
 
 
 def rows(group: Callable[[str, str], str]) -> Parser:
-    """Of the rows of scripts that judge them: each row, and as key figures their means (of counts sums) by group."""
+    """Rows of scripts that judge them: each row, and as key figures their means (for counts, sums) by group."""
 
     def parse(command: str, text: str) -> Iterator[Figure]:
         groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
@@ -128,7 +128,7 @@ def _each(case: str, what: str) -> str:
 
 
 def odd_scenes(command: str, text: str) -> Iterator[Figure]:
-    """Of its table: scenes, refusals, and what is wrong, of each kind and of all."""
+    """Its table: scenes, refusals and errors, for each kind and for all."""
     kinds = re.findall(r"^  (\S.*?) +(\d+) +(\d+) +(\d+) +(\d+)$", text, re.MULTILINE)
     counts = [sum(int(kind[at]) for kind in kinds) for at in range(1, 5)]
     if not counts[0]:
@@ -143,7 +143,7 @@ def odd_scenes(command: str, text: str) -> Iterator[Figure]:
 
 
 def false_alarms(command: str, text: str) -> Iterator[Figure]:
-    """Of its table: false alarms of clean scenes, faults named and false alarms beside them."""
+    """Its table: false alarms of correct scenes, faults named, and false alarms beside them."""
     pattern = r"^(.+?) +(\d+) scenes +(?:named in (\d+), +)?(\d+) false alarms +(yes|no)"
     found = re.findall(pattern, text, re.MULTILINE)
     scenes = [(name, int(count), named, int(alarms), verdict) for name, count, named, alarms, verdict in found]
@@ -163,12 +163,12 @@ def false_alarms(command: str, text: str) -> Iterator[Figure]:
 
 def _share(command: str, name: str, count: int, of: int) -> Figure:
     share = count / of
-    least = NONE_YET / of  # of a share of 0 or 1, too, one case more or less is chance
+    least = NONE_YET / of  # even a share of 0 or 1 has an error of one case
     return Figure(command, f"{name}, share", share, max(math.sqrt(share * (1.0 - share) / of), least))
 
 
 def benchmark(command: str, text: str) -> Iterator[Figure]:
-    """Of its report: our seconds, the ratio to the fastest other solver, memory, errors."""
+    """Its report: our seconds, the ratio to the fastest other solver, memory, errors."""
     report = json.loads(text)
     yield Figure(command, "import, s", report["import_seconds"]["ceres-cal"])
     yield Figure(command, "first calibration of a process takes longer by, s", report["first_call_seconds"])
@@ -192,7 +192,7 @@ def benchmark(command: str, text: str) -> Iterator[Figure]:
 
 
 def benchmark_lenses(command: str, text: str) -> Iterator[Figure]:
-    """Of its report: seconds by lens, and what the choice of a lens adds."""
+    """Its report: seconds for each lens, and for the automatic choice."""
     for row in json.loads(text)["lenses"]:
         for what in ("brown", "spline", "auto"):
             yield Figure(command, f"{row['frames']} frames, {what}, s", row[what])
@@ -207,9 +207,9 @@ class Command:
     """A script that measures.
 
     Attributes:
-        script: its name, wherever below scripts/ it is. parse: what makes figures of its answer.
-        quick: arguments for small runs; full: otherwise, and so many runs where it has --runs.
-        json: how the script gives its figures to other programs: as a "file", printed to "stdout", or not, "".
+        script: its name, anywhere below scripts/. parse: makes figures of its output.
+        quick: arguments for small runs. full: other arguments, with `runs` as --runs where it has this option.
+        json: how the script writes its figures: to a "file", to "stdout", or not, "".
         jobs: whether it has --jobs.
     """
 
@@ -238,7 +238,7 @@ COMMANDS: dict[str, Command] = {
         "benchmark", benchmark_lenses, ("--lenses", "--frames", "20", "--repeat", "1"), 0, ("--lenses",), jobs=False
     ),
 }
-"""By the name that the table has."""
+"""By their names in the table."""
 
 
 class NoFiguresError(Exception):
@@ -281,7 +281,7 @@ def measured(name: str, checkout: Path, chosen: argparse.Namespace) -> list[Figu
 
 
 def _environment() -> dict[str, str]:
-    """Photographs that are not part of the repository are those beside this checkout, for another checkout, too."""
+    """Photographs outside of the repository are those beside this checkout, also for another checkout."""
     beside = {name: str(ROOT.parent / place) for name, place in SHARED.items() if (ROOT.parent / place).is_dir()}
     return {**beside, **os.environ}
 
@@ -289,7 +289,7 @@ def _environment() -> dict[str, str]:
 # ---- the table ------------------------------------------------------------------------------------------------------
 
 
-Setting = Mapping[str, Any]  # what must be the same of two tables that are compared
+Setting = Mapping[str, Any]  # must be the same for two tables that are compared
 
 
 def load(path: Path, setting: Setting) -> dict[tuple[str, str], Figure]:
@@ -311,7 +311,7 @@ def load(path: Path, setting: Setting) -> dict[tuple[str, str], Figure]:
 
 
 def save(path: Path, commit: str, setting: Setting, figures: Sequence[Figure]) -> None:
-    """Store a table, whole or not at all."""
+    """Store a table, completely or not at all."""
     part = path.with_name(f"{path.name}.part")
     table = {"commit": commit, "setting": setting, "figures": [asdict(each) for each in figures]}
     part.write_text(json.dumps(table, indent=1), encoding="utf-8")
@@ -332,7 +332,7 @@ def _value(figure: Figure) -> str:
 
 
 def arguments_of(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What is asked for."""
+    """The parsed arguments."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0], allow_abbrev=False)
     parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS), help="only these commands")
     parser.add_argument("--quick", action="store_true", help="few runs of each: does it work? Figures say little")

@@ -1,8 +1,8 @@
-"""Side by side with other calibrators, on the same observations: python scripts/peers.py [--help]
+"""Comparison with other calibrators on the same observations: python scripts/peers.py [--help]
 
-Installs each peer into an environment of its own under build/peers, asks all of them and ceres-cal the same questions,
-prints a table for each and stores the answers in docs/peers.json, of which docs/peers.md is made. Real sets are looked
-for in $CERES_CAL_REAL, or shared/real beside the repository; the one of data/opencv_left is always there.
+Installs each peer into its own environment below build/peers, asks all of them and ceres-cal the same questions, prints
+a table for each question, and stores the answers in docs/peers.json, from which docs/peers.md is made. Real sets are
+read from $CERES_CAL_REAL, or shared/real beside the repository; the set in data/opencv_left is always available.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _QUICK_FAULTS = ("sound", "repeated picture")
 
 
 def measured(given: argparse.Namespace, peers: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """The rows of each table that is asked for."""
+    """The rows of each requested table."""
     found: dict[str, list[dict[str, Any]]] = {}
     with tempfile.TemporaryDirectory() as name, over_processes(given.jobs):
         folder = Path(name)
@@ -48,7 +48,7 @@ def measured(given: argparse.Namespace, peers: Sequence[str]) -> dict[str, list[
 
 
 def _asked(given: argparse.Namespace, tasks: Iterable[boards.Task]) -> list[boards.Task]:
-    """All of them; of the quick form the defaults."""
+    """All tasks, or for --quick those with default settings."""
     return [one for one in tasks if not given.quick or one.setting in _QUICK_SETTINGS]
 
 
@@ -92,7 +92,7 @@ def _print(found: Mapping[str, Sequence[Mapping[str, Any]]], question: str) -> N
 
 
 def merged(before: dict[str, Any], found: Mapping[str, Sequence[dict[str, Any]]]) -> dict[str, Any]:
-    """What is stored, with new rows in place of those that they repeat."""
+    """The stored rows, with new rows replacing old ones with the same key."""
     after = dict(before)
     for name, rows in found.items():
         key = _KEYS[name]
@@ -103,7 +103,7 @@ def merged(before: dict[str, Any], found: Mapping[str, Sequence[dict[str, Any]]]
 
 
 def written(stored: Mapping[str, Any]) -> str:
-    """As JSON, a line for each row, with five figures."""
+    """JSON with a line for each row, and with five digits."""
 
     def short(value: Any) -> Any:
         if isinstance(value, float):

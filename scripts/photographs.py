@@ -1,7 +1,7 @@
-"""How well photographs are read: python scripts/photographs.py [--help]
+"""Accuracy of measurements in photographs: python scripts/photographs.py [--help]
 
-Rendered photographs of varied lens, light, blur, wear and robots, whose truth is known, and a real one. Every figure
-stands beside the value it must keep to. Exits with 1 when a figure is missed.
+The photographs are rendered with varied lenses, light, blur, wear and robots, and with known truth; one is real. Every
+figure is printed beside its limit. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CASES = (
 
 
 def cases(real: Path | None, picture: Path | None, kinds: Sequence[str]) -> dict[str, Callable[[int], Iterable[Row]]]:
-    """By name; those of real photographs where these are."""
+    """Cases by name; those with real photographs only where these exist."""
     own: dict[str, Callable[[int], Iterable[Row]]] = {
         "lines": lambda runs: line_figures(range(runs)),
         "floor": floor_rows,

@@ -1,17 +1,17 @@
-"""Keeps a calibration right: checks it against new observations, and refits it where a camera has moved. Copy it.
+"""Keeps a calibration up to date: checks it against new observations, and refits it after a move. Copy this file.
 
     python scripts/refit_after_move.py calibration.json new.json photograph.jpg   # these files, once
     python scripts/refit_after_move.py calibration.json --watch incoming/         # every file that appears there
 
-A file holds observations, or is a photograph in which the field is found from where the calibration has it. It asks
-twice before it acts: when a file says that a camera has moved, the calibration is "suspected", and only when the next
-one says so, too, it is refitted from that. In --checks checks (720: hourly for a month) an unmoved camera is refitted
-with a probability of --false-alarms at most, if errors of different files are independent of each other.
+A file contains observations, or is a photograph in which the field is searched near its calibrated place. Two files
+must agree before anything changes: if a file shows that a camera has moved, the calibration is "suspected"; if the next
+file shows it, too, the calibration is refitted from that file. In --checks checks (720: hourly for a month) an unmoved
+camera is refitted with a probability of at most --false-alarms, if errors of different files are independent.
 Every event is one line of JSON on standard output, or in --log: "holds", "suspected", "refitted", "refused" (nothing
-was changed; the reason says what to do), "unreadable", or "folder" (the watched one has gone, or is back). With --log a
-suspicion lasts from one run to the next. Ctrl-C and SIGTERM end the watch when the file in hand is done. The
-calibration is replaced in one step, and the one before is kept in previous/ beside it. Exits with 0 when the
-calibration is right at the end, 3 when the last file raised a suspicion, was refused or could not be read.
+was changed; the reason says what to do), "unreadable", or "folder" (the watched folder is gone, or is back). With --log
+a suspicion is remembered from one run to the next. Ctrl-C and SIGTERM end the watch after the current file. The
+calibration is replaced in one step, and the previous one is kept in previous/ beside it. Exits with 0 when the
+calibration holds at the end, 3 when the last file raised a suspicion, was refused or could not be read.
 """
 
 from __future__ import annotations
@@ -42,11 +42,13 @@ from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
 from ceres_cal.moves.refit_plan import WHAT
 from ceres_cal.moves.refits import movements
 
-SUSPICIOUS = ("suspected", "refused")  # of a file that was checked
+SUSPICIOUS = ("suspected", "refused")  # events of a checked file
 
 
 def handle(place: Path, source: Path, given: argparse.Namespace, suspected: bool) -> dict[str, Any]:
-    """Check the calibration at `place` against a file, refit it where it does not hold and was suspected; the event."""
+    """Check the calibration at `place` against a file, and refit it where it fails and was suspected; returns the
+    event.
+    """
     begin = time.perf_counter()
     event: dict[str, Any] = {"time": now(), "file": str(source)}
     try:
@@ -103,17 +105,17 @@ def checked(
 
 
 def level(given: argparse.Namespace) -> float:
-    """False alarms of one check such that two of them, one after the other, are as rare as asked for in all checks."""
+    """False alarm probability of one check; two in a row are then as rare as required over all checks."""
     return math.sqrt(float(given.false_alarms) / int(given.checks))
 
 
 def told(found: Agreements) -> dict[str, str]:
-    """The answer of each station, in words."""
+    """The answer for each station, in words."""
     return {name: station.words for name, station in found.items()}
 
 
 def keep(place: Path) -> Path:
-    """A copy of the calibration in previous/, named after the moment."""
+    """Copies the calibration to previous/, with the time in its name."""
     folder = make_folder(place.parent / "previous")
     copy = folder / f"{place.stem}-{datetime.now(UTC):%Y%m%dT%H%M%S%f}{place.suffix}"
     write_bytes(copy, read_bytes(place))
@@ -121,10 +123,10 @@ def keep(place: Path) -> Path:
 
 
 def is_suspected(log: Path | None) -> bool:
-    """Whether the last file that was checked, by the log, was no longer explained by the calibration."""
+    """Whether the log says that the last checked file disagreed with the calibration."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log is not None and log.is_file() else []
     for line in reversed(lines):
-        with suppress(ValueError):  # half a line of a run that was killed
+        with suppress(ValueError):  # an incomplete line of a run that was killed
             event = json.loads(line)
             if isinstance(event, dict) and "check" in event:
                 return event.get("event") in SUSPICIOUS
@@ -138,7 +140,7 @@ def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
         nonlocal suspected
         try:
             event = handle(given.calibration, source, given, suspected)
-        except Exception as error:  # a week of watching does not end with one odd file
+        except Exception as error:  # one odd file must not end a week of watching
             reason = f"unexpected {error!r}: please report it"
             return {"time": now(), "file": str(source), "event": "refused", "reason": reason}
         if "check" in event:
@@ -151,12 +153,12 @@ def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def watched(given: argparse.Namespace, answer: Callable[[Path], dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """What comes of the files that appear in the folder, until Ctrl-C or SIGTERM: the file in hand is done first."""
+    """Events of files that appear in the folder, until Ctrl-C or SIGTERM; the current file is finished first."""
     stopped = threading.Event()
 
     def stop(*_: object) -> None:
         if stopped.is_set():
-            raise KeyboardInterrupt  # somebody means it
+            raise KeyboardInterrupt  # a second signal ends at once
         stopped.set()
 
     for number in (signal.SIGINT, signal.SIGTERM):

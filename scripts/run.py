@@ -1,4 +1,4 @@
-"""Runs a script of the folders here by its name: python scripts/run.py NAME [--help]; without a name it lists them."""
+"""Runs a script of the subfolders by its name: python scripts/run.py NAME [--help]; without a name it lists them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _MAIN = re.compile(r"^(?:def main\(|main = )", re.MULTILINE)
 
 
 def scripts() -> dict[str, Path]:
-    """Those that have a `main`, by name."""
+    """The scripts that have a `main`, by name."""
     return {path.stem: path for path in sorted(HERE.glob("*/*.py")) if _MAIN.search(path.read_text(encoding="utf-8"))}
 
 
 def listed() -> str:
-    """A line for each, by folder."""
+    """A line for each script, by folder."""
     lines = []
     for name, path in scripts().items():
         first = path.read_text(encoding="utf-8").partition("\n")[0].strip('"')
@@ -35,10 +35,10 @@ def main(arguments: Sequence[str]) -> int:
     if path is None:
         print(f"run.py: there is no script {name!r}: `python scripts/run.py` lists them", file=sys.stderr)
         return 2
-    sys.argv = [f"run.py {name}", *given]  # what a parser calls the program
+    sys.argv = [f"run.py {name}", *given]  # the program's name in its help
     script = importlib.import_module(f"{path.parent.name}.{name}")
     if {"-h", "--help"} & {*given} and not hasattr(script, "parser") and not hasattr(script, "argparse"):
-        print(script.__doc__)  # it takes paths alone
+        print(script.__doc__)  # it has no parser, since it takes only paths
         return 0
     code: int = script.main(given)
     return code

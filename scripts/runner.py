@@ -1,4 +1,4 @@
-"""What the measuring scripts share: figures beside their limits, processes, options, and one rule for the exit code.
+"""Common parts of the measuring scripts: figures with their limits, processes, options, and one rule for the exit code.
 
 A script has cases, each of which makes figures from a number of runs; `script` makes its command. A script that has
 options or a table of its own starts from `parser` and ends with `measured` or `finished`.
@@ -27,7 +27,7 @@ _executor: ContextVar[Executor | None] = ContextVar("executor", default=None)
 
 @contextmanager
 def over_processes(jobs: int) -> Iterator[None]:
-    """While it lasts, what `over` does goes over so many processes; 0 is one a core."""
+    """Within this context, `over` uses so many processes; 0 is one for each core."""
     with processes(jobs) as executor:
         token = _executor.set(executor)
         try:
@@ -37,7 +37,7 @@ def over_processes(jobs: int) -> Iterator[None]:
 
 
 def over(function: Callable[..., _T], *items: Iterable[Any]) -> Iterator[_T]:
-    """What a function, defined at the top of a module, makes of each of the items, in order: of seeds, mostly."""
+    """Results of a function, defined at the top of a module, for each of the items (mostly seeds), in order."""
     return each(function, *items, executor=_executor.get())
 
 
@@ -46,7 +46,7 @@ def over(function: Callable[..., _T], *items: Iterable[Any]) -> Iterator[_T]:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure. `error` is its standard error, 0 where it is no mean; it must lie between `least` and `most`."""
+    """One figure. `error` is its standard error, 0 if it is not a mean; it must lie between `least` and `most`."""
 
     case: str
     what: str
@@ -64,7 +64,7 @@ class Row:
         return "yes" if missed <= 0.0 else "open" if missed <= 2.0 * self.error else "no"
 
     def to_json(self) -> dict[str, Any]:
-        """Its fields, without limits that it does not have, and the verdict."""
+        """Its fields, without infinite limits, and the verdict."""
         return {name: value for name, value in vars(self).items() if value not in (np.inf, -np.inf)} | {
             "verdict": self.verdict
         }
@@ -77,14 +77,14 @@ class Row:
 
 
 def mean_and_error(values: Any) -> tuple[float, float]:
-    """The mean over runs, and its standard error: 0 of a single run, which has no spread."""
+    """The mean over runs, and its standard error; 0 for a single run."""
     values = np.asarray(values, dtype=float)
     spread = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
     return float(np.mean(values)), spread
 
 
 def root_and_error(squares: Any) -> tuple[float, float]:
-    """The root mean square over runs of squares, and its standard error."""
+    """The root mean square over runs from squares, and its standard error."""
     mean, error = mean_and_error(squares)
     return float(np.sqrt(mean)), error / (2.0 * float(np.sqrt(mean)))
 
@@ -104,21 +104,22 @@ def parser(description: str | None, runs: tuple[int, str], cases: Iterable[str] 
     """The options that every measuring script has.
 
     Args:
-        description: the script's own; its first line goes into the help. runs: the default number, and of what.
+        description: the script's docstring; its first line is shown in the help. runs: the default number, and its
+        meaning.
     """
     options = argparse.ArgumentParser(description=(description or "").partition("\n")[0], allow_abbrev=False)
     options.add_argument("--runs", type=int, default=runs[0], help=f"{runs[1]} (default {runs[0]})")
     if names := list(cases):
         options.add_argument("--case", nargs="+", action="extend", choices=names, help="only these (default all)")
-    options.add_argument("--jobs", type=int, default=1, help="processes; 0 is one a core (default 1): the same figures")
-    options.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write the figures there, or print them")
+    options.add_argument("--jobs", type=int, default=1, help="processes, 0: one per core (default 1): the same figures")
+    options.add_argument("--json", nargs="?", const="-", metavar="FILE", help="write figures to FILE, or print them")
     return options
 
 
 def measured(
     cases: Cases, given: argparse.Namespace, over_all: Callable[[Sequence[Row]], Iterable[Row]] = lambda rows: ()
 ) -> int:
-    """Measure the cases asked for, print each figure and what each case took; the exit code."""
+    """Measure the requested cases, print each figure and the time of each case; returns the exit code."""
     rows: list[Row] = []
     quiet = given.json == "-"
 
@@ -138,7 +139,7 @@ def measured(
 
 
 def finished(rows: Sequence[Row], given: argparse.Namespace) -> int:
-    """Write the figures where --json says; 1 when a figure is missed."""
+    """Write the figures where --json says; returns 1 when a figure is missed."""
     if given.json:
         text = json.dumps([row.to_json() for row in rows], indent=1)
         if given.json == "-":
@@ -155,10 +156,10 @@ def script(
     least_runs: int = 1,
     over_all: Callable[[Sequence[Row]], Iterable[Row]] = lambda rows: (),
 ) -> Callable[[Sequence[str] | None], int]:
-    """The `main` of a script that has no options of its own; see `parser` and `measured`.
+    """The `main` of a script without options of its own; see `parser` and `measured`.
 
     Args:
-        least_runs: 2 where a spread is asked for. over_all: what is said of all figures together.
+        least_runs: 2 where a spread is needed. over_all: makes figures of all figures together.
     """
 
     def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The usual scenes, put together from a few parts: fields, boards and rings before any number of stations."""
+"""The usual scenes, composed of a few parts: fields, boards and rings in front of any number of stations."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ def overhead_pose(
 ) -> Pose:
     """cam_from_world of a camera that looks down at the floor.
 
-    At yaw 0 and without tilt the image's x runs along the field's x and the image's y against the field's y. Yaw turns
-    the camera counter-clockwise as seen from above. Tilt is one rotation about (tilt_x, tilt_y) in the image, so its
-    size is hypot(tilt_x, tilt_y): a positive tilt_x looks further down the image, a positive tilt_y further left.
+    Without yaw and tilt the image's x has the direction of the field's x, and the image's y is opposite to the field's
+    y. Yaw rotates the camera counter-clockwise as seen from above. Tilt is one rotation about (tilt_x, tilt_y) in the
+    image, with the angle hypot(tilt_x, tilt_y): a positive tilt_x looks towards the lower part of the image, a positive
+    tilt_y towards its left.
     """
     yaw = np.deg2rad(yaw_deg)
     down = np.diag([1.0, -1.0, -1.0]) @ rotation_exp([0.0, 0.0, -yaw])
@@ -41,8 +42,8 @@ def overhead_pose(
 
 @dataclass(frozen=True)
 class BoardRanges:
-    """Ranges of how a board is held before the first camera: the distance to its middle, and the angle between its
-    normal and the line of sight to that.
+    """Ranges for a board in front of the first camera: the distance of its centre, and the angle between its normal and
+    the line of sight to the centre.
     """
 
     distance_m: tuple[float, float] = (1.0, 2.5)
@@ -73,7 +74,7 @@ def board_placements(
 
 
 def _random_board_pose(board: Target, camera: Camera, held: BoardRanges, rng: np.random.Generator) -> Pose:
-    """cam_from_board with the board's middle at a random pixel."""
+    """cam_from_board with the board's centre at a random pixel."""
     pixel = rng.uniform((0.0, 0.0), camera.image_size)
     direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
     tilt = np.deg2rad(rng.uniform(*held.tilt_deg))
@@ -92,10 +93,10 @@ def field_scene(
     spacing_m: float = 0.1,
     name: str = "field",
 ) -> Scene:
-    """A target that lies in the world, seen in `frames` frames from every station.
+    """A target fixed in the world, seen in `frames` frames from every station.
 
-    Frames are numbered for each camera, "0001" first: cameras that see the field at once share the names, a camera at
-    several stations takes one frame after the other.
+    Frames are numbered for each camera from "0001" on. Cameras that see the field at the same time share the names; a
+    camera with several stations takes one frame after the other.
     """
     taken: Counter[str] = Counter()
     views = []
@@ -115,7 +116,7 @@ def board_scene(
     seed: int,
     held: BoardRanges = BoardRanges(),
 ) -> Scene:
-    """A board held at `count` places, each seen whole from every station at once (see `board_placements`)."""
+    """A board held at `count` places; each is seen whole from every station at once (see `board_placements`)."""
     posed = [cameras[station.camera].at(station.cam_from_world) for station in stations.values()]
     poses = board_placements(board, posed, count, seed, held)
     placements = {f"board_{number:02d}": pose for number, pose in enumerate(poses, start=1)}
@@ -132,7 +133,7 @@ def rings_scene(
     spacing_m: float = 0.02,
     name: str = "rings",
 ) -> Scene:
-    """A sheet of concentric rings before the first station: the paper's figure 2. The view has no points."""
+    """A sheet of concentric rings in front of the first station: the paper's figure 2. The view has no points."""
     station_name, station = next(iter(stations.items()))
     placement = station.cam_from_world.inverse @ cam_from_sheet
     view = ViewPlan((name,), station_name, name, name, points=(), spacing_m=spacing_m)
@@ -140,7 +141,7 @@ def rings_scene(
 
 
 def join(*scenes: Scene) -> Scene:
-    """Several scenes as one: their views one after the other, photographed as the first that says how.
+    """Several scenes as one: all views in order, with the first photography that is defined.
 
     Raises:
         InputError: a name means different things in two scenes.

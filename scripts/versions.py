@@ -1,8 +1,8 @@
-"""A smoke run on each Python here, with the oldest and newest allowed dependencies: python scripts/versions.py [--help]
+"""A smoke run on each Python, with the oldest and newest allowed dependencies: python scripts/versions.py [--help]
 
-uv builds a wheel for each Python, and installs it with them into build/versions. Each environment detects, calibrates,
-diagnoses, reports and exports; the numbers must agree between all of them. `scripts/test --versions` runs it. Exits
-with 1 where one fails or differs.
+uv builds a wheel for each Python, and installs it with its dependencies into build/versions. Each environment detects,
+calibrates, diagnoses, reports and exports; the numbers must agree between all of them. `scripts/test --versions` runs
+this script. Exits with 1 where one fails or differs.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ FOLDER = ROOT / "build" / "versions"
 PYTHONS = ("3.11", "3.12", "3.13")
 RESOLUTIONS = ("lowest-direct", "highest")
 HOME = ROOT / "data" / "ssl_field"
-AGREEMENT = 1e-6  # relative, of phi: the tolerance at which solves end is 5e-8
+AGREEMENT = 1e-6  # relative, of phi; solves end with a tolerance of 5e-8
 
 
 def uv(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run uv, from an environment of its own."""
+    """Run uv from its own environment."""
     program = FOLDER / "uv" / "bin" / "uv"
     if not program.is_file():
         subprocess.run([sys.executable, "-m", "venv", FOLDER / "uv"], check=True)
         subprocess.run(
             [FOLDER / "uv" / "bin" / "pip", "install", "--quiet", "uv"], check=True, stderr=subprocess.DEVNULL
         )
-    others = sorted(Path.home().glob(".pyenv/versions/*/bin"))  # whose shims know one version alone
+    others = sorted(Path.home().glob(".pyenv/versions/*/bin"))  # its shims know only one version
     path = os.pathsep.join([*map(str, others), os.environ["PATH"]])
     own = {**os.environ, "PATH": path}
     return subprocess.run([program, *arguments], env=own, capture_output=True, text=True)
 
 
 def interpreter(version: str) -> Path | None:
-    """One that the machine has, or that uv can install; None where there is none."""
+    """A Python of the machine, or one that uv installs; None where there is none."""
     for _ in range(2):
         found = uv("python", "find", "--no-project", version)
         if found.returncode == 0:
@@ -64,7 +64,7 @@ def environment(python: Path, version: str, resolution: str) -> Path:
     (wheel,) = wheels.glob("*.whl")
     binary = ["--only-binary", ":all:", "--resolution", resolution]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    # Named, too: what only the wheel asks for is no direct requirement, of which the lowest is wanted.
+    # Named explicitly: "lowest-direct" applies to direct requirements only, not to those of the wheel.
     _done(uv("pip", "install", "--python", python_there, *binary, wheel, *project["dependencies"]))
     return python_there
 
@@ -75,7 +75,7 @@ def _done(step: subprocess.CompletedProcess[str]) -> None:
 
 
 def smoke(python: Path) -> dict[str, float]:
-    """What the commands made of the sample; RuntimeError where one failed or warned."""
+    """Results of the commands on the sample; RuntimeError where one fails or warns."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
 
@@ -107,7 +107,7 @@ def smoke(python: Path) -> dict[str, float]:
 
 
 def difference(one: dict[str, float], other: dict[str, float]) -> float:
-    """Largest, relative, of two environments' focal lengths."""
+    """Largest relative difference of the focal lengths of two environments."""
     return max(abs(one[name] / other[name] - 1.0) for name in ("phi", "phi_of_boards"))
 
 

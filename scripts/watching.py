@@ -1,7 +1,7 @@
-"""Watching a folder for weeks, and a journal of what was done: what `refit_after_move.py` stands on. Copy both.
+"""Watching a folder for weeks, and a journal of events; the base of `refit_after_move.py`. Copy both.
 
-The folder, the log and standard output may go away and come back, the clock may be set back, and anything may lie in
-the folder: only regular files with the right endings are looked at, each once it has stopped growing.
+The folder, the log and standard output may disappear and come back, the clock may be set back, and the folder may
+contain anything: only regular files with the right endings are used, each after it has stopped growing.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
-_MOST_KEPT = 10_000  # events that could not be written yet
+PATIENCE = 3  # attempts before a file counts as unreadable, since it may still be arriving
+_MOST_KEPT = 10_000  # events that wait to be written
 
 Stamp = tuple[int, int, int]
 
 
 class Folder:
-    """Files that appear in a folder; one that changes appears again. Its memory is of the files that lie there now."""
+    """Files that appear in a folder; a changed file appears again. It remembers only files that still exist."""
 
     def __init__(self, path: Path, endings: Collection[str]) -> None:
         self._path, self._endings = path, endings
@@ -30,10 +30,10 @@ class Folder:
         self.is_there = True
 
     def look(self) -> list[Path]:
-        """What has appeared, or is to be tried again, in the order of the files' times."""
+        """New files, and files that are tried again, in the order of their times."""
         now = self._files()
         self.is_there = now is not None
-        if now is None:  # what was done stays known for when it is back
+        if now is None:  # processed files stay known until the folder is back
             return []
         # A file that is still being written has grown since the last look.
         ready = [path for path in now if now[path] != self._done.get(path) and now[path] == self._before.get(path)]
@@ -42,7 +42,7 @@ class Folder:
         return sorted(ready, key=lambda path: now[path])
 
     def again(self, path: Path) -> bool:
-        """Whether a file that could not be read comes again, after the others; it does not for ever."""
+        """Whether a file that could not be read is tried again, after the others; the number of attempts is limited."""
         self._tries[path] = self._tries.get(path, 0) + 1
         if self._tries[path] % PATIENCE == 0:
             return False
@@ -50,7 +50,7 @@ class Folder:
         return True
 
     def _files(self) -> dict[Path, Stamp] | None:
-        """Time, size and number of each file; None where the folder is not there."""
+        """Time, size and inode of each file; None where the folder does not exist."""
         found: dict[Path, Stamp] = {}
         try:
             with os.scandir(self._path) as entries:
@@ -65,10 +65,10 @@ class Folder:
 
 def _add(found: dict[Path, Stamp], entry: os.DirEntry[str]) -> None:
     try:
-        if entry.is_file():  # no pipe, no device
+        if entry.is_file():  # not a pipe or a device
             status = entry.stat()
             found[Path(entry.path)] = (status.st_mtime_ns, status.st_size, status.st_ino)
-    except OSError:  # it has just gone, or leads round in circles
+    except OSError:  # it was just removed, or is a circular link
         pass
 
 
@@ -88,12 +88,12 @@ class Journal:
                 with self._log.open("a", encoding="utf-8") as log:
                     log.write("".join(self._waiting))
             self._waiting.clear()
-        except (OSError, ValueError):  # a full disk, a folder that has gone, a stream that is closed
+        except (OSError, ValueError):  # a full disk, a removed folder, a closed stream
             pass
 
     def _print(self) -> None:
         try:
             sys.stdout.write("".join(self._waiting))
             sys.stdout.flush()
-        except BrokenPipeError:  # nobody reads any more, and nobody will
+        except BrokenPipeError:  # the reader has ended, and none will follow
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

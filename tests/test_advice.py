@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accuracy.advice import CASES, Kept, followed, promised_for
+from accuracy.advice import CASES, FollowUp, followed, promised_for
 from accuracy.bound import make_trial
 from accuracy.scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
 from accuracy.scenes import Problem as Case
@@ -257,7 +257,7 @@ def _noise(calibration: Calibration) -> float:
 @pytest.mark.thorough
 def test_the_map_is_off_by_what_was_promised() -> None:
     """Beyond what is stated: what it is off by in fact, where phi was open before; 5 runs, 32 % of chance."""
-    problem, kept = PROBLEMS["whole field, 3 deg"](), Kept()
+    problem, kept = PROBLEMS["whole field, 3 deg"](), FollowUp()
     tape = first_of(advised("whole field, 3 deg"))["tape"].measurement
     for seed in range(5):
         calibration = calibrated("whole field, 3 deg", seed)

@@ -25,7 +25,7 @@ NAMES = FIELD.curve_names
 OUTER = {"TopTouchLine": 1, "BottomTouchLine": -1, "LeftGoalLine": 1, "RightGoalLine": -1}
 
 
-def off_px(shot: disturbed.Taken, curve: Indices32, pixels: Array) -> Array:
+def off_px(shot: disturbed.DisturbedShot, curve: Indices32, pixels: Array) -> Array:
     """Distances from the true curves."""
     return np.abs(distances_px(Shot(None, shot.camera, FIELD, None, True), curve, pixels))  # type: ignore[arg-type]
 

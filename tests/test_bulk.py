@@ -24,14 +24,14 @@ from ceres_cal.simulate import Disturbance, simulate
 OUTLIERS = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.05)
 
 
-class Calibrated(Protocol):
+class CalibrateInShares(Protocol):
     def __call__(
         self, observations: Observations, progress: Callable[[Progress], None] | None = None
     ) -> Calibration: ...
 
 
 @pytest.fixture
-def in_shares(monkeypatch: pytest.MonkeyPatch) -> Calibrated:
+def in_shares(monkeypatch: pytest.MonkeyPatch) -> CalibrateInShares:
     """A calibration of few observations as of very many: a dozen shares, a part of a quarter."""
 
     def calibrated(observations: Observations, progress: Callable[[Progress], None] | None = None) -> Calibration:
@@ -60,7 +60,7 @@ def assert_same(one: Calibration, other: Calibration) -> None:
         assert getattr(one.fit, name) == pytest.approx(value, rel=2e-3), name
 
 
-def test_all_take_part_though_a_part_decides(in_shares: Calibrated) -> None:
+def test_all_take_part_though_a_part_decides(in_shares: CalibrateInShares) -> None:
     observations = simulate(half_field(32), OUTLIERS, 4).observations
     of_shares = in_shares(observations)
     assert len(of_shares.rejected) > 100
@@ -73,7 +73,7 @@ def test_all_take_part_though_a_part_decides(in_shares: Calibrated) -> None:
 
 
 @pytest.mark.parametrize("frame", partly([None, "0017"], ["0017"]))
-def test_whole_that_does_not_belong_is_taken_out_of_all(frame: str | None, in_shares: Calibrated) -> None:
+def test_whole_that_does_not_belong_is_taken_out_of_all(frame: str | None, in_shares: CalibrateInShares) -> None:
     observations = moved_aside(simulate(half_field(32), NOISE, 4).observations, "HalfwayLine", 4.0, frame)
     of_shares, of_all = in_shares(observations), calibrate(observations, RADIAL)
     where = "all 32 frames" if frame is None else f"frame {frame!r}"
@@ -81,12 +81,12 @@ def test_whole_that_does_not_belong_is_taken_out_of_all(frame: str | None, in_sh
     assert_same(of_shares, of_all)
 
 
-def test_boards_beside_the_world_stay_at_hand(in_shares: Calibrated) -> None:
+def test_boards_beside_the_world_stay_at_hand(in_shares: CalibrateInShares) -> None:
     observations = simulate(two_cameras("radial-2-3"), OUTLIERS, 4).observations
     assert_same(in_shares(observations), calibrate(observations, RADIAL))
 
 
-def test_from_files_the_answer_is_the_same_to_the_last_bit(in_shares: Calibrated, tmp_path: Path) -> None:
+def test_from_files_the_answer_is_the_same_to_the_last_bit(in_shares: CalibrateInShares, tmp_path: Path) -> None:
     observations = simulate(half_field(32), OUTLIERS, 4).observations
     observations.save(tmp_path / "day.columns")
     stored, at_hand = in_shares(Observations.load(tmp_path / "day.columns")), in_shares(observations)
@@ -96,7 +96,7 @@ def test_from_files_the_answer_is_the_same_to_the_last_bit(in_shares: Calibrated
     assert stored.rejected == at_hand.rejected
 
 
-def test_what_the_caller_raises_ends_it(in_shares: Calibrated) -> None:
+def test_what_the_caller_raises_ends_it(in_shares: CalibrateInShares) -> None:
     observations = simulate(half_field(32), NOISE, 4).observations
     seen: list[Progress] = []
     in_shares(observations, seen.append)

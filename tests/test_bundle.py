@@ -96,7 +96,7 @@ def distance(a: Estimate, b: Estimate) -> float:
 # ---- the optimum ----------------------------------------------------------------------------------------------------
 
 
-class Dense:
+class DenseSolver:
     """The same robust problem for scipy: one row for each component, derivatives by differences, no elimination.
 
     An observation of length s counts rho(s^2): its components are multiplied with the root of rho(s^2) / s^2.
@@ -156,7 +156,7 @@ class Dense:
 def test_robust_optimum_is_scipys(name: str, loss: str) -> None:
     weighting = Weighting(1.1, 0.9, loss, 2.5)
     found = solved(name, weighting)
-    expected, cost = Dense(name, weighting).solve()
+    expected, cost = DenseSolver(name, weighting).solve()
     assert found.converged and not found.failed
     # With a loss it is scipy that stops short, 1e-8 of the cost above ours at most.
     assert found.cost < cost * (1.0 + 1e-12)
@@ -169,7 +169,7 @@ def test_robust_optimum_is_scipys(name: str, loss: str) -> None:
 def test_no_step_leads_further_down(name: str, loss: str) -> None:
     """Placements seen twice, eliminated ones and rings: the gradient by differences of the plain problem vanishes."""
     weighting = Weighting(1.1, 0.9, loss, 2.5)
-    dense = Dense(name, weighting)
+    dense = DenseSolver(name, weighting)
     dense.start = solved(name, weighting).estimate
     count = sum(len(free) for free in dense.layout.free.values()) + 6 * len(dense.poses)
     rows, jacobian = dense.rows(np.zeros(count)), np.empty((len(dense.rows(np.zeros(count))), count))
@@ -182,7 +182,7 @@ def test_no_step_leads_further_down(name: str, loss: str) -> None:
     assert np.max(np.abs(jacobian.T @ rows)[told] / size[told]) < 1e-6  # 4e-8 measured
 
 
-def dense_is_px(dense: Dense, k: int) -> bool:
+def dense_is_px(dense: DenseSolver, k: int) -> bool:
     """Whether unknown k is phi or a principal point, in px."""
     numbers = np.concatenate([dense.layout.free[name] for name in dense.start.cameras])
     return int(numbers[k]) in (0, 2, 3)

@@ -20,7 +20,7 @@ PACKAGE = Path(__file__).parents[1] / "src" / "ceres_cal"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 
-class Slow:
+class SlowObject:
     """A value that takes as long as `go` is not set."""
 
     def __init__(self) -> None:
@@ -35,8 +35,8 @@ class Slow:
         return object()
 
 
-def fast() -> Slow:
-    one = Slow()
+def fast() -> SlowObject:
+    one = SlowObject()
     one.go.set()
     return one
 
@@ -66,11 +66,11 @@ def test_it_is_computed_once_and_keeps_its_words() -> None:
     one = fast()
     assert one.value is one.value
     assert one.calls == 1
-    assert Slow.__dict__["value"].__doc__ == "What the test reads."
+    assert SlowObject.__dict__["value"].__doc__ == "What the test reads."
 
 
 def test_threads_share_the_first_value() -> None:
-    one, found = Slow(), list[object]()
+    one, found = SlowObject(), list[object]()
     threads = [threading.Thread(target=lambda: found.append(one.value)) for _ in range(4)]
     for thread in threads:
         thread.start()
@@ -82,7 +82,7 @@ def test_threads_share_the_first_value() -> None:
 
 def test_nobody_waits_for_another_instance() -> None:
     """With functools' of Python 3.11 the fork hangs for ever, and so does a second thread."""
-    slow = Slow()
+    slow = SlowObject()
     thread = threading.Thread(target=lambda: slow.value)
     thread.start()
     slow.begun.wait()

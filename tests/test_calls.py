@@ -139,10 +139,10 @@ def test_a_lens_that_python_has_alone_is_solved_as_a_compiled_one(lens: str) -> 
     camera, seen = looked_at(lens)
     cost, normal = normal_equations(camera, seen, "huber", 1.5)
 
-    class Own(type(camera.lens)):  # type: ignore[misc]
+    class OwnLens(type(camera.lens)):  # type: ignore[misc]
         kind = "of one's own"
 
-    own = replace(camera, lens=Own(*(getattr(camera.lens, one.name) for one in fields(camera.lens))))
+    own = replace(camera, lens=OwnLens(*(getattr(camera.lens, one.name) for one in fields(camera.lens))))
     assert camera_optics(own).kind == ""
     other, plain = normal_equations(own, seen, "huber", 1.5)
     assert other == pytest.approx(cost, rel=1e-9)  # 2e-13 measured
@@ -153,7 +153,7 @@ def test_a_lens_that_python_has_alone_is_solved_as_a_compiled_one(lens: str) -> 
 
 
 @dataclass(frozen=True)
-class Broken(Brown):
+class BrokenLens(Brown):
     kind = "broken"
 
     def _distort(self, rays: Array, phi: float) -> Array:
@@ -163,7 +163,7 @@ class Broken(Brown):
 def test_what_a_lens_raises_is_said() -> None:
     camera, seen = looked_at("brown")
     with pytest.raises(InputError, match="cannot be asked"):
-        normal_equations(replace(camera, lens=Broken()), seen)
+        normal_equations(replace(camera, lens=BrokenLens()), seen)
 
 
 def test_what_needs_no_kernel_loads_none(tmp_path: Path) -> None:

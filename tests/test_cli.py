@@ -41,27 +41,27 @@ ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
 
 
-class Said(NamedTuple):
+class CommandResult(NamedTuple):
     code: int
     out: str
     err: str
 
 
-Say = Callable[..., Said]
+Say = Callable[..., CommandResult]
 
 
 @pytest.fixture
 def say(capsys: pytest.CaptureFixture[str]) -> Say:
     """Runs a command in this process."""
 
-    def run(*arguments: object) -> Said:
+    def run(*arguments: object) -> CommandResult:
         code = main([str(argument) for argument in arguments])
-        return Said(code, *capsys.readouterr())
+        return CommandResult(code, *capsys.readouterr())
 
     return run
 
 
-def refused(said: Said, code: int = 2) -> str:
+def refused(said: CommandResult, code: int = 2) -> str:
     """The one line of an error, with nothing else said."""
     assert said.code == code, said
     if said.out:  # with --json
@@ -759,7 +759,7 @@ def test_what_no_pixel_of_the_image_shows_is_not_located(say: Say, calibrated: P
 
 def test_locate_in_text(say: Say, calibrated: Path) -> None:
     x, y = Calibration.load(calibrated).station().locate(np.array([[640.0, 480.0]]))[0]
-    assert say("locate", calibrated, "640,480") == Said(0, f"{x:.4f} {y:.4f}\n", "")
+    assert say("locate", calibrated, "640,480") == CommandResult(0, f"{x:.4f} {y:.4f}\n", "")
     assert say("locate", "640,480", "--height-mm", "0", calibrated).code == 2  # the calibration comes first
 
 

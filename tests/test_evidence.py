@@ -137,7 +137,7 @@ def test_sum_of_logarithms_far_below_zero() -> None:
 
 
 @dataclass(frozen=True)
-class Seen:
+class LinearisedCase:
     """A calibration's linear model, and the same written down: what the free numbers leave (E, E), and residuals."""
 
     model: Linearised
@@ -151,7 +151,7 @@ class Seen:
         return restricted(self.left, columns, self.residuals, covariance, self.model.spare, self.basis)
 
 
-def linearised(observations: Observations) -> Seen:
+def linearised(observations: Observations) -> LinearisedCase:
     options = Options(lens="radial", usual_camera=False, loss="trivial", noise_scale="stated")
     calibration = calibrate(observations, options)
     problem, estimate = calibration.problem(observations), calibration.estimate
@@ -163,18 +163,18 @@ def linearised(observations: Observations) -> Seen:
     taken = [model.private * (equations.sight == sight)[:, None] for sight in range(len(equations.bounds) - 1)]
     values, basis = np.linalg.eigh(sum(part @ part.T for part in (*taken, model.shared)))
     left = np.eye(len(equations)) - basis[:, values > 0.5] @ basis[:, values > 0.5].T
-    return Seen(model, Case(problem, estimate, model), left, model.score, basis_of(left))
+    return LinearisedCase(model, Case(problem, estimate, model), left, model.score, basis_of(left))
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
+def seen() -> LinearisedCase:
     """Lines and points of a field, and two boards."""
     observations = simulate(overhead(frames=1, boards=2), NOISE, 3).observations
     points, curves = (np.arange(len(rows)) % 3 == 0 for rows in (observations.points, observations.curves))
     return linearised(observations.part(points, curves))
 
 
-def test_a_line_aside(seen: Seen) -> None:
+def test_a_line_aside(seen: LinearisedCase) -> None:
     """Log odds of each line, with every size of its offset and of the scatter of all written down."""
     model, equations = seen.model, seen.model.equations
     _, group = grouped(equations.view * 100 + equations.feature, equations.is_curve)
@@ -197,7 +197,7 @@ def test_a_line_aside(seen: Seen) -> None:
         assert odds[line] - none == pytest.approx(wanted, abs=1e-6)
 
 
-def test_a_bent_board(seen: Seen) -> None:
+def test_a_bent_board(seen: LinearisedCase) -> None:
     """How probable its bows are, and how large."""
     model, prior = seen.model, SizePrior(0.5, (1e-4, 3e-4, 1e-3))
     columns = (seen.model.equations.built[:, 2:4] * model.weight[:, None]) * ~model.equations.is_curve[:, None]
@@ -212,7 +212,7 @@ def test_a_bent_board(seen: Seen) -> None:
     assert sigma == pytest.approx(np.sqrt(weight[1:] @ prior.scatter[1:] ** 2 / weight[1:].sum()), rel=1e-9)
 
 
-def test_a_rough_lens(seen: Seen) -> None:
+def test_a_rough_lens(seen: LinearisedCase) -> None:
     """The likeliest size of waves along the radius is where the same likelihood, of known noise, is largest."""
     offsets = half_diagonals(seen.case.estimate.cameras["overhead"], seen.model.equations.pixel)
     radius = np.linalg.norm(offsets, axis=1)
@@ -245,7 +245,7 @@ def test_correlated_errors() -> None:
         assert at.log[place] - at.log[0] == pytest.approx(seen.log(every, together) - none, abs=1e-6)
 
 
-def test_the_probability_of_a_diagnostic(seen: Seen) -> None:
+def test_the_probability_of_a_diagnostic(seen: LinearisedCase) -> None:
     """A score test asks the amounts of the largest likelihood: those under a size without bounds."""
     for effect in (EFFECTS["skew"], EFFECTS["decentring"], EFFECTS["curve aside"]):
         (columns,) = effect.columns(seen.case)

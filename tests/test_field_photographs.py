@@ -322,12 +322,12 @@ def test_a_picture_whose_search_fails_numerically_is_a_miss(
 
 
 @pytest.fixture(scope="module")
-def small() -> disturbed.Taken:
+def small() -> disturbed.DisturbedShot:
     """A small photograph, and the camera that took it."""
     return disturbed.taken("plain", 0, FIELD)
 
 
-def test_another_place_is_told_apart(tmp_path: Path, small: disturbed.Taken) -> None:
+def test_another_place_is_told_apart(tmp_path: Path, small: disturbed.DisturbedShot) -> None:
     """A camera that was moved, or another one: what most pictures show is kept, in any order."""
     moved = cv2.warpAffine(small.image, np.array([[1.0, 0.0, 10.0], [0.0, 1.0, 0.0]]), small.image.shape[1::-1])
     paths = [tmp_path / f"{name}.png" for name in ("moved", "first", "second")]

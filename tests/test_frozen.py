@@ -35,7 +35,7 @@ class Size(Frozen, eq=True):
     height: int = 1
 
 
-class Coloured(Ring, kw_only=True):
+class ColouredRing(Ring, kw_only=True):
     """With a number that is given by name."""
 
     colour: int
@@ -66,14 +66,14 @@ def test_or_by_what_it_holds() -> None:
 
 
 def test_it_is_a_dataclass_to_everybody() -> None:
-    ring = Coloured(np.zeros(2), "red", colour=1)
+    ring = ColouredRing(np.zeros(2), "red", colour=1)
     assert [one.name for one in fields(ring)] == ["places", "name", "notes", "colour"]
     assert replace(ring, colour=2).colour == 2
-    assert repr(ring) == "Coloured(places=array([0., 0.]), name='red', notes=[], colour=1)"
+    assert repr(ring) == "ColouredRing(places=array([0., 0.]), name='red', notes=[], colour=1)"
     for again in (copy.copy(ring), pickle.loads(pickle.dumps(ring))):
         assert (again.name, again.colour, again.size) == ("red", 1, 2)
     with pytest.raises(TypeError, match="colour"):
-        Coloured(np.zeros(2))  # type: ignore[call-arg]
+        ColouredRing(np.zeros(2))  # type: ignore[call-arg]
 
 
 def test_what_a_file_leaves_out_is_the_default() -> None:
@@ -85,9 +85,9 @@ def test_what_a_file_leaves_out_is_the_default() -> None:
 def test_a_default_is_a_value_of_the_class() -> None:
     """`run` of a folder of cameras asks its class for what nobody asked for, and found none."""
 
-    class Named(Frozen):
+    class NameHolder(Frozen):
         name: str = field(default="ring", metadata={"help": "what it is called"})
         notes: list[str] = field(default_factory=list)
 
-    assert Named.name == Named().name == "ring"
-    assert not hasattr(Named, "notes")
+    assert NameHolder.name == NameHolder().name == "ring"
+    assert not hasattr(NameHolder, "notes")

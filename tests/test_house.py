@@ -147,8 +147,9 @@ def test_class_names_are_nouns() -> None:
     """A participle leaves open what it is of. "As built" and "linearised" are terms of the field (docs/design.md)."""
     classes = [
         node.name
-        for path in (SRC / PACKAGE).rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for folder in (SRC / PACKAGE, *(SRC.parent / name for name in ("scripts", "tests")))
+        for path in folder.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.ClassDef)
     ]
     irregular = ("Built", "Found", "Kept", "Known", "Left", "Made", "Seen", "Shown", "Taken", "Told")

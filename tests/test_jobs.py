@@ -35,7 +35,7 @@ def said(as_script: Callable[..., str]) -> Callable[..., str]:
     return run
 
 
-Said = Callable[..., str]
+JobOutput = Callable[..., str]
 
 
 def test_each_is_short() -> None:
@@ -44,21 +44,21 @@ def test_each_is_short() -> None:
     assert {name: count for name, count in lines.items() if count > MOST_LINES + 1} == {}  # and what it is, above
 
 
-def test_corners_of_opencv(said: Said) -> None:
+def test_corners_of_opencv(said: JobOutput) -> None:
     phi = float(said("opencv_corners").split("[[")[1].split()[0])
     assert phi == pytest.approx(869.7, abs=1.0)  # 869.72 measured
 
 
-def test_lines_from_arrays(said: Said) -> None:
+def test_lines_from_arrays(said: JobOutput) -> None:
     assert "phi 868.8 px" in (text := said("lines_from_array")) and float(text.split()[-1]) < 1.5  # 1.04 mm measured
 
 
-def test_the_ball(said: Said, calibration: Path) -> None:
+def test_the_ball(said: JobOutput, calibration: Path) -> None:
     lines = said("ball_at_60_hz", folder=calibration.parent).splitlines()
     assert len(lines) == 60 and float(lines[0].split()[0]) == pytest.approx(-2.117, abs=0.002)
 
 
-def test_a_refit_and_a_comparison(said: Said, calibration: Path, tmp_path: Path) -> None:
+def test_a_refit_and_a_comparison(said: JobOutput, calibration: Path, tmp_path: Path) -> None:
     now = Path(shutil.copy(calibration, tmp_path / "now.json"))
     assert said("refit_by_cron", now, ROOT / "data/ssl_field_moved/photographs/0001.jpg").startswith("moved, 0.")
     assert said("refit_by_cron", now, ROOT / "data/ssl_field_moved/photographs/0001.jpg") == ""

@@ -108,11 +108,11 @@ def test_a_name_is_given_once() -> None:
     register(Division)  # the same again is no other
 
     @dataclass(frozen=True)
-    class Another(Division):
+    class SecondDivision(Division):
         pass
 
     with pytest.raises(InputError, match="there is a lens 'division' already"):
-        register(Another)
+        register(SecondDivision)
 
 
 def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:

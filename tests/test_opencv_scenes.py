@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from accuracy import opencv_scenes
 from accuracy.odd_scenes import MOST_RADII, MOST_SIGMAS, farthest, observed
-from accuracy.opencv_camera import SeenByOpenCv, Tilted
+from accuracy.opencv_camera import OpenCvCamera, TiltedSensor
 from accuracy.opencv_scenes import CASES, KINDS, changed, checked, outcome, refitted
 from accuracy.scenes import Problem
 from scenery import overhead_pose
@@ -27,9 +27,9 @@ _LENSES: dict[str, tuple[float, Lens]] = {
 }
 
 
-def _seen_by(phi: float, lens: Lens) -> SeenByOpenCv:
+def _seen_by(phi: float, lens: Lens) -> OpenCvCamera:
     pose = overhead_pose(0.3, 0.2, 4.0, tilt_x_deg=10.0, tilt_y_deg=20.0, yaw_deg=30.0)
-    return SeenByOpenCv((1280, 960), phi, (641.0, 477.0), lens, 1.01, pose)
+    return OpenCvCamera((1280, 960), phi, (641.0, 477.0), lens, 1.01, pose)
 
 
 def _places() -> Array:
@@ -49,7 +49,7 @@ def test_opencv_shows_what_the_package_shows(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["brown", "kannala-brandt", "tilted"])
 def test_there_and_back(name: str) -> None:
-    camera = _seen_by(*_LENSES.get(name, (850.0, Tilted((*_BROWN, 0.02, -0.01)))))
+    camera = _seen_by(*_LENSES.get(name, (850.0, TiltedSensor((*_BROWN, 0.02, -0.01)))))
     places = _places()
     inside = in_image(camera.project(places), camera.image_size)
     back = camera.locate(camera.project(places[inside]), 0.15)
@@ -58,7 +58,7 @@ def test_there_and_back(name: str) -> None:
 
 def test_a_tilted_sensor_is_no_camera_of_the_package() -> None:
     """Its lens has more than the package's of that name."""
-    camera, places = _seen_by(850.0, Tilted((*_BROWN, 0.02, -0.01))), _places()
+    camera, places = _seen_by(850.0, TiltedSensor((*_BROWN, 0.02, -0.01))), _places()
     own = _seen_by(850.0, Brown(_BROWN)).project(places)
     inside = in_image(own, camera.image_size)
     assert np.max(np.linalg.norm(camera.project(places) - own, axis=1)[inside]) > 5.0

@@ -36,7 +36,7 @@ class Form:
     options: Mapping[str, tuple[Any, str]] = field(default_factory=lambda: {"error_mm": (float, "")})
 
 
-class Every(QuietArguments):
+class EveryFieldType(QuietArguments):
     """One field of each kind."""
 
     first: Path = argument("FIRST", "a file")
@@ -53,15 +53,15 @@ class Every(QuietArguments):
     form: Mapping[str, str] = options_of(lambda: [Form()])
 
 
-def read(*arguments: str) -> Every:
+def read(*arguments: str) -> EveryFieldType:
     parser = Parser(prog="every")
-    add_options(parser, Every)
-    return filled(Every, parser.parse_intermixed_args(arguments))
+    add_options(parser, EveryFieldType)
+    return filled(EveryFieldType, parser.parse_intermixed_args(arguments))
 
 
 def test_what_is_left_out_is_the_default() -> None:
-    assert read("x", "--size", "2") == Every(first=Path("x"), size=2.0)
-    assert {one.name: one.default for one in fields(Every)}["count"] == 3
+    assert read("x", "--size", "2") == EveryFieldType(first=Path("x"), size=2.0)
+    assert {one.name: one.default for one in fields(EveryFieldType)}["count"] == 3
 
 
 def test_everything_has_its_type() -> None:
@@ -69,7 +69,7 @@ def test_everything_has_its_type() -> None:
         "x 1 --size 2cm 2 --count 4 --scale .5 --kind b --name p --name q --holds --no-usual --one --error-mm 9 --quiet"
     )
     args = read(*typed.split())
-    assert args == Every(
+    assert args == EveryFieldType(
         first=Path("x"), rest=(1, 2), count=4, scale=0.5, size=20.0, kind="b", name=("p", "q"), holds=True, usual=False,
         one=True, form={"error_mm": "9"}, quiet=True,
     )  # fmt: skip
@@ -99,7 +99,7 @@ def test_wrong_usage(arguments: Sequence[str], words: str) -> None:
 
 def test_the_help_says_the_default_and_what_may_be_repeated() -> None:
     parser = Parser()
-    add_options(parser, Every)
+    add_options(parser, EveryFieldType)
     said = parser.format_help()
     for words in (
         "how many; default: 3",

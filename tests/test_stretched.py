@@ -19,7 +19,7 @@ _CAMERAS = {  # phi, middle, k1 k2, turn, place
 _SIZE = (1280, 1024)
 
 
-class _Stretched:
+class _StretchedCamera:
     """A camera above a division B field whose fy is not its fx."""
 
     def __init__(self, camera: str, aspect: float) -> None:
@@ -54,7 +54,7 @@ class _Stretched:
         return points + Observations.from_curves(lines, field, _SIZE, sigma_px=0.15, camera=camera)
 
 
-def _off_over_stated(calibration: Calibration, camera: _Stretched, name: str = "camera") -> float:
+def _off_over_stated(calibration: Calibration, camera: _StretchedCamera, name: str = "camera") -> float:
     """The farthest of places over the field, .15 m above it, over its 95 % radius."""
     x, y = np.meshgrid(np.linspace(-4.0, 4.0, 9), np.linspace(-2.5, 2.5, 6))
     places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.15)])
@@ -67,7 +67,7 @@ def _off_over_stated(calibration: Calibration, camera: _Stretched, name: str = "
 @pytest.mark.parametrize(("name", "aspect"), [("tilted", 1.0263), ("about straight down", 0.971)])
 def test_a_stretched_picture_is_one_by_itself(name: str, aspect: float) -> None:
     """It was taken for square, to .0005, at 5 standard deviations of the observations; robot height 20 radii off."""
-    camera = _Stretched(name, aspect)
+    camera = _StretchedCamera(name, aspect)
     calibration = calibrate(camera.seen(3))
     known = calibration.uncertainty.verdict("camera", "camera", "aspect")
     assert _off_over_stated(calibration, camera) < 1.5  # .50 and .32
@@ -77,7 +77,7 @@ def test_a_stretched_picture_is_one_by_itself(name: str, aspect: float) -> None:
 
 @pytest.mark.parametrize("name", _CAMERAS)
 def test_square_pixels_stay_square(name: str) -> None:
-    camera = _Stretched(name, 1.0)
+    camera = _StretchedCamera(name, 1.0)
     calibration = calibrate(camera.seen(4))
     assert abs(calibration.station().aspect - 1.0) < 1e-3
     assert calibration.uncertainty.verdict("camera", "camera", "aspect").sd < 1e-3
@@ -87,7 +87,7 @@ def test_square_pixels_stay_square(name: str) -> None:
 @pytest.mark.parametrize("aspects", [(1.02, 1.02), (1.0, 1.03), (1.0, 1.0)])
 def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, float]) -> None:
     """Both came out square, to .0005: robot height was 19 radii off."""
-    cameras = {name: _Stretched(name, aspect) for name, aspect in zip(_CAMERAS, aspects, strict=True)}
+    cameras = {name: _StretchedCamera(name, aspect) for name, aspect in zip(_CAMERAS, aspects, strict=True)}
     tilted, straight = (camera.seen(5, name) for name, camera in cameras.items())
     calibration = calibrate(tilted + straight)
     for (name, camera), aspect in zip(cameras.items(), aspects, strict=True):

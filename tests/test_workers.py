@@ -176,7 +176,7 @@ def _kept_by(client: Any) -> int:
 def test_workers_that_keep_nothing_are_lost_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody is there to be asked, and nobody to be named."""
 
-    class Nobody:
+    class DeadClient:
         scheduler = None
 
         def __getattr__(self, name: str) -> Callable[..., Any]:
@@ -185,8 +185,8 @@ def test_workers_that_keep_nothing_are_lost_in_words(monkeypatch: pytest.MonkeyP
 
         key = "a"
 
-    monkeypatch.setattr(Nobody, "scheduler", Nobody())
+    monkeypatch.setattr(DeadClient, "scheduler", DeadClient())
     monkeypatch.setattr(engines, "_PAUSE_S", 0.0)
     share: Any = "a share"
     with pytest.raises(SolutionError, match=r"lost again and again: have they enough memory\?$"):
-        engines.OnWorkers(Nobody(), [share]).ask(lambda _: None)
+        engines.OnWorkers(DeadClient(), [share]).ask(lambda _: None)

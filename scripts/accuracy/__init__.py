@@ -1,1 +1,1 @@
-"""What simulated observations say of answers: how near, how honest, how often wrong."""
+"""Accuracy, honesty of stated uncertainties and false alarms, measured on simulated observations."""

@@ -1,8 +1,8 @@
-"""How near the answers come to what the noise allows: python scripts/run.py accuracy [--help]
+"""Accuracy of calibrations compared with what the noise allows: python scripts/run.py accuracy [--help]
 
-Every figure comes from simulated scenes and stands beside the value it must keep to and, where it is a mean, beside its
-own standard error. "yes": kept; "no": missed; "open": missed by less than two standard errors, so more runs must tell.
-Exits with 1 when a figure is missed.
+Every figure comes from simulated scenes. It is printed beside its limit and, if it is a mean, beside its standard
+error. "yes": the limit is kept. "no": it is missed. "open": it is missed by less than two standard errors, so that more
+runs are needed. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Arc, Target
 from ceres_cal.simulate import Disturbance, simulate
 
-MOST_SIGMA = 4.0  # a mean farther from 0 than so many of its own standard errors is a bias
-LEAST_GAIN = 1e-6  # share of a pose's cost; what a better pose must save to be another pose
-DIVERGED = 5.0  # times the expected mean error; no bad luck goes so far
+MOST_SIGMA = 4.0  # a mean that differs from 0 by more than this many of its standard errors is a bias
+LEAST_GAIN = 1e-6  # share of a pose's cost that another pose must save to count as different
+DIVERGED = 5.0  # multiple of the expected mean error which chance does not reach
 TOLERANCES = {"field": Tolerance(lines_m=0.010)}
-DRAWS = 4000  # from a covariance, to tell the median of what is not normally distributed
+DRAWS = 4000  # from a covariance, for the median of a quantity that is not normally distributed
 
 
 # ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------
 
 
 def efficiency_rows(case: str, problem: Problem, disturbance: Disturbance, most: float, runs: int) -> Iterator[Row]:
-    """Squared error over the bound, the same over the best on this noise, bias and failures."""
+    """Squared error over the bound and over the best estimate from the same noise, the bias, and the failures."""
     found = efficiency(problem, disturbance, range(runs))
     numbers = f"{len(found.keys)} numbers, {len(found.squared)} runs"
     yield Row(case, "squared error / Cramer-Rao bound", *found.ratio, 2.0 - most, most, numbers)
@@ -79,11 +79,11 @@ def outliers_case(runs: int) -> Iterator[Row]:
 
 
 def mirrored_count(calibration: Calibration, observations: Observations, cam_from_board: Mapping[str, Array]) -> int:
-    """Placements whose cost, of all observations, is lower when the search for their pose starts with the truth.
+    """Number of placements whose cost is lower after a search that starts from the true pose.
 
     Args:
-        cam_from_board: placement -> true rotation (3, 3). The middle of the board stays where it was found: mirrored
-            poses have it in the same place.
+        cam_from_board: placement -> true rotation (3, 3). The search starts with the middle of the board where it was
+            found, since a mirrored pose has it in the same place.
     """
     sights = gather_sights(observations)
     weighting = Weighting(calibration.fit.point_scale, 1.0, calibration.options.loss, calibration.options.loss_scale)
@@ -116,7 +116,7 @@ def _mirrored_wide(frames: int, seed: int) -> tuple[int, float]:
 
 
 def mirrored_small(frames: int, disturbance: Disturbance, seed: int) -> int:
-    """How many of so many small boards end mirrored."""
+    """The number of small boards, out of `frames`, whose pose ends mirrored."""
     simulation = simulate(small_boards(frames, seed), disturbance, seed)
     calibration = calibrate(simulation.observations, Options(lens="brown"))
     rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
@@ -127,7 +127,7 @@ def mirrored_small(frames: int, disturbance: Disturbance, seed: int) -> int:
 
 
 def map_errors_mm(truth: Camera, estimate: Camera, places: Array, height_m: float) -> Array:
-    """How far off (N,) the estimate locates the places (N, 2) m that the image shows at this height."""
+    """Errors (N,) with which the estimate locates the places (N, 2) m that the image shows at this height."""
     world = np.column_stack([places, np.full(len(places), height_m)])
     pixels = truth.project(world)
     shown = np.all((pixels >= -0.5) & (pixels <= np.array(truth.image_size) - 0.5), axis=1)
@@ -135,7 +135,7 @@ def map_errors_mm(truth: Camera, estimate: Camera, places: Array, height_m: floa
 
 
 def predicted_mm(problem: Problem, places: Array, height_m: float) -> Array:
-    """The map error (DRAWS, N) that the Cramer-Rao bound lets expect, by differences of the true camera's map."""
+    """Errors (DRAWS, N) of places predicted by the Cramer-Rao bound, with derivatives of the true camera's map."""
     trial = make_trial(problem, SSL_NOISE, 0)
     known = bound(trial)
     keys, covariance = known.keys, np.linalg.inv(known.matrix)
@@ -154,7 +154,7 @@ def predicted_mm(problem: Problem, places: Array, height_m: float) -> Array:
 
 
 def median_and_error(values: Array, expected: Array) -> tuple[float, float]:
-    """The median, and its standard error if the values are distributed as expected."""
+    """The median, and its standard error if the values have the expected distribution."""
     picks = np.random.default_rng(0).integers(len(expected), size=(500, len(values)))
     return float(np.median(values)), float(np.std(np.median(expected[picks], axis=1)))
 
@@ -194,7 +194,7 @@ def ssl_vision_rows(name: str, problem: Problem, runs: int) -> Iterator[Row]:
 
 
 def offset_errors_mm(calibration: Calibration, truth_m: Mapping[str, float], field: Target) -> Array:
-    """Error of each number of the field as built, less the shift, turn and scale of the whole that fits them best."""
+    """Error of each number of the field as built, after the best-fitting shift, rotation and scale are removed."""
     structure = calibration.estimate.structure
     found = dict(zip(structure.names, structure.values.tolist(), strict=True))
     errors = np.array([found[f"field/{name}"] - value for name, value in truth_m.items()])
@@ -203,7 +203,7 @@ def offset_errors_mm(calibration: Calibration, truth_m: Mapping[str, float], fie
 
 
 def _moved_by_the_whole(name: str, field: Target) -> tuple[float, float, float, float]:
-    """What a shift along x and y, a turn and a scaling of the field do to one of its numbers."""
+    """The change of one number of the field under a shift along x and y, a rotation and a scaling."""
     curve_name, _, part = name.partition(".")
     curve = field.curves[curve_name]
     if isinstance(curve, Arc):
@@ -237,7 +237,7 @@ def _offsets_from_six_stations(seed: int) -> Array:
 
 
 def floor_errors_of_two_cameras(seed: int, heights_known: bool) -> list[float]:
-    """Mean field error (mm) with the nominal field and with tolerances, over what each camera sees of the floor."""
+    """Mean field error (mm) with the nominal field and with tolerances, over the floor that each camera sees."""
     painted, means = painted_by_two_cameras(seed, heights_known), []
     for options in (Options(lens="radial"), Options(lens="radial", tolerances=TOLERANCES)):
         stations = calibrate(painted.observations, options).stations
@@ -249,7 +249,7 @@ def floor_errors_of_two_cameras(seed: int, heights_known: bool) -> list[float]:
     return means
 
 
-# ---- all together ---------------------------------------------------------------------------------------------------
+# ---- the cases ------------------------------------------------------------------------------------------------------
 
 CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "boards": partial(clean_case, ("boards, radial", "boards, brown")),

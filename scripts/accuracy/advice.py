@@ -1,11 +1,11 @@
-"""Whether advice keeps its promises: python scripts/run.py advice [--help]
+"""Whether the promises of `advise` are kept: python scripts/run.py advice [--help]
 
-Of each scene the calibration is asked what to measure next; each answer is followed in simulation, again and again with
-other noise, and the calibration made anew. Beside each promise (worst and mean error of located points at 150 mm) is
-what the new calibration states of itself and what its map is off by in fact. Where today's observations leave phi open,
-a promise depends on it: what counts is then the promise for the phi that is found (for the true one, of what is off in
-fact), and whether what is stated lies within the range that was given. A promise that says itself that it is rough is
-shown and not judged. Exits with 1 when a figure is missed by more than two of its standard errors.
+For each scene the calibration is asked what to measure next. Each measurement that it proposes is simulated many times
+with new noise, and the calibration is repeated with it. Each promise (worst and mean error of located points at 150 mm)
+is compared with the error that the new calibration states and with its true error. Where today's observations do not
+determine phi, a promise depends on phi. Then the stated error is compared with the promise for the phi that is found,
+the true error with the promise for the true phi, and the stated error must lie within the promised range. A promise
+that is marked as rough is shown but not judged. Exits with 1 when a figure is missed by more than two standard errors.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ceres_cal.simulate import Scene, simulate
 
 WITHIN = 0.1
 LEAST_IN_RANGE = 0.9
-OTHER_NOISE = 1_000_000  # added to a seed: what is measured besides has noise of its own
+OTHER_NOISE = 1_000_000  # added to a seed, so that the additional measurements have noise of their own
 
 
 def half_field(tilt_deg: float) -> Problem:
@@ -59,7 +59,7 @@ CASES: Mapping[str, Callable[[], Problem]] = {
 def followed(
     measurement: Measurement, calibration: Calibration, observations: Observations, scene: Scene, seed: int
 ) -> Calibration:
-    """The calibration made anew with what was measured besides, in the true scene, with its own noise."""
+    """The calibration repeated with the additional measurement, simulated in the true scene with its own noise."""
     rng = np.random.default_rng([OTHER_NOISE, seed])
     options = calibration.options
     (station,) = scene.stations
@@ -94,14 +94,15 @@ def _moved(
 
 
 @dataclass
-class Kept:
-    """One measurement, followed again and again, where the promise was rough and where it was not.
+class FollowUp:
+    """Results of one measurement that is simulated many times; there is one object for rough promises, one for others.
 
     Attributes:
-        promised, stated: (runs, 2) worst and mean, mm: for the phi that was found. at_truth: (runs, 2) the same promise
-            for the true phi. sd_mm: (runs, N) the map that is stated. off_m: (runs, N, 2) what it is off by in fact;
-            the worst is where the map is worst.
-        in_range: whether the worst error stated lies within what was promised over the whole valley.
+        promised, stated: (runs, 2) worst and mean error, mm; promised for the phi that was found.
+        at_truth: (runs, 2) the same promise for the true phi.
+        sd_mm: (runs, N) the stated map. off_m: (runs, N, 2) its true errors; the worst error is taken where the stated
+            map is worst.
+        in_range: whether the worst stated error lies within the range that was promised for all possible phi.
     """
 
     promised: list[tuple[float, float]] = field(default_factory=list)
@@ -112,7 +113,7 @@ class Kept:
     in_range: list[bool] = field(default_factory=list)
 
     def add(self, promise: Promise, found: Calibration, scene: Scene) -> None:
-        """What one run brought."""
+        """Adds the result of one run."""
         (name,) = scene.stations
         camera = scene.stations[name].camera
         stated = found.uncertainty.map_sd_mm(name, ROBOT_TOP_M)
@@ -127,7 +128,7 @@ class Kept:
             self.in_range.append(low / (1.0 + WITHIN) <= stated.worst_mm <= high * (1.0 + WITHIN))
 
     def rows(self, case: str, words: str) -> Iterator[Row]:
-        """Stated and in fact, over what was promised."""
+        """The stated and the true errors, divided by the promised ones."""
         promised, stated, at_truth = (np.array(v) for v in (self.promised, self.stated, self.at_truth))
         runs, limits = len(promised), (1.0 - WITHIN, 1.0 + WITHIN)
         rms = 1e3 * np.sqrt(np.mean(np.sum(np.array(self.off_m) ** 2, axis=2), axis=0))
@@ -147,7 +148,7 @@ class Kept:
             yield Row(case, f"{words}: in the range", share, share_error(share, runs), LEAST_IN_RANGE)
 
     def rough_row(self, case: str, words: str) -> Row:
-        """Rough promises, shown and not judged: the worst error stated over the one promised, if not both unknown."""
+        """Rough promises, shown but not judged: worst stated over worst promised error, where both are finite."""
         promised, stated = (np.array(v)[:, 0] for v in (self.promised, self.stated))
         told = np.isfinite(promised) & np.isfinite(stated)
         both = np.count_nonzero(np.isinf(promised) & np.isinf(stated))
@@ -157,7 +158,7 @@ class Kept:
 
 
 def promised_for(promise: Promise, phi_px: float) -> tuple[float, float]:
-    """Worst and mean; of a promise that depends on phi those for this one."""
+    """Worst and mean error; of a promise that depends on phi, those for this phi."""
     if not promise.valley:
         return promise.after.worst_mm, promise.after.mean_mm
     phi, errors = zip(*(each for each in promise.valley if np.isfinite(each[1].worst_mm)), strict=True)
@@ -167,7 +168,7 @@ def promised_for(promise: Promise, phi_px: float) -> tuple[float, float]:
 
 
 def errors_m(calibration: Calibration, scene: Scene, places: Array) -> Array:
-    """(N, 2) by how much the calibration locates places at ROBOT_TOP_M amiss; NaN where the true camera sees none."""
+    """(N, 2) errors of places at ROBOT_TOP_M that the calibration locates; NaN where the true camera does not see."""
     (name,) = scene.stations
     camera, truth = calibration.station(name), scene.camera_at(name)
     pixels = truth.project(np.column_stack([places, np.full(len(places), ROBOT_TOP_M)]))
@@ -177,10 +178,10 @@ def errors_m(calibration: Calibration, scene: Scene, places: Array) -> Array:
 
 
 def rows(case: str, make: Callable[[], Problem], runs: int) -> Iterator[Row]:
-    """The advice of the first run, followed in all of them, with the promises of each."""
+    """The advice of the first run, followed in all runs, with the promises of each run."""
     problem = make()
     measurements: list[Measurement] = []
-    kept: list[tuple[Kept, Kept]] = []
+    kept: list[tuple[FollowUp, FollowUp]] = []
     failed: list[str] = []
     for seed, (trial, calibration) in enumerate(attempts(problem, CLEAN_NOISE, range(runs))):
         if calibration is None:
@@ -191,7 +192,7 @@ def rows(case: str, make: Callable[[], Problem], runs: int) -> Iterator[Row]:
         if not measurements:
             first = here
             measurements = [promise.measurement for promise in advise(calibration, name, ROBOT_TOP_M).promises]
-            kept = [(Kept(), Kept()) for _ in measurements]
+            kept = [(FollowUp(), FollowUp()) for _ in measurements]
         now = [measurement.before(first, here) for measurement in measurements]
         for ones, promise in zip(kept, promised(calibration, now, name, ROBOT_TOP_M), strict=True):
             try:
@@ -209,7 +210,7 @@ def rows(case: str, make: Callable[[], Problem], runs: int) -> Iterator[Row]:
 
 
 def short_name(measurement: Measurement) -> str:
-    """Its kind, with its sigma or how many of it."""
+    """The kind of the measurement, with its sigma or its number of steps."""
     if measurement.priors:
         prior = measurement.priors[0]
         return f"{prior.quantity.removesuffix('_m')} to {1e3 * prior.sigma[0]:.0f} mm"
@@ -217,7 +218,7 @@ def short_name(measurement: Measurement) -> str:
 
 
 def over_all(every: Sequence[Row]) -> Iterator[Row]:
-    """What is stated, and what it is in fact, over what was promised: mean and range of all scenes and measurements."""
+    """Stated and true errors divided by the promised ones: mean and range over all scenes and measurements."""
     for what in ("stated", "in fact"):
         ratios = [row.value for row in every if row.what.endswith(f" {what}")]
         if ratios:

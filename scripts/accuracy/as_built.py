@@ -1,10 +1,10 @@
-"""Targets that are not where they are drawn: python scripts/run.py as_built [--help]
+"""Targets that differ from their drawing: python scripts/run.py as_built [--help]
 
-Boards whose corners are off in the plane or in height, that are bent, or that are as drawn, simulated with independent
-noise. How often something is found, the sigma that is estimated over the true one, how many of the 95 % intervals of
-the camera's numbers hold the truth, and the squared error over that of targets as drawn. Then real sets: the error at
-which views are predicted that were left out, over that of targets as drawn. Exits with 1 when a figure is missed by
-more than two standard errors.
+The simulated boards have corners that are displaced in the plane or in height, are bent, or are as drawn; their noise
+is independent. Printed are how often a difference is found, the estimated sigma over the true one, the coverage of the
+95 % intervals of the camera's numbers, and the squared error over that of a calibration with the targets as drawn. For
+real sets: the error of predicted views that were left out, over that with the targets as drawn. Exits with 1 when a
+figure is missed by more than two standard errors.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Board:
     """How a board is built, and how often it is seen.
 
     Attributes:
-        points_m, bow_m, heights_m: standard deviations. stretch: by what share it is longer along x. views: of it.
-        columns, rows: of its corners.
+        points_m, bow_m, heights_m: standard deviations. stretch: relative elongation along x. views: number of views.
+        columns, rows: number of its corners.
     """
 
     points_m: float = 0.0
@@ -96,7 +96,7 @@ def _spread(calibration: Calibration) -> Array:
 
 
 def _both(board: Board, seed: int) -> tuple[Scene, Calibration, Calibration]:
-    """The scene of a seed, and what it comes to as built and as drawn."""
+    """The scene of a seed, and its calibrations with the target as built and as drawn."""
     scene, observations = observed(board, seed)
     return scene, calibrate(observations, BUILT), calibrate(observations, DRAWN)
 
@@ -133,7 +133,7 @@ def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
 
 
 def real_rows(runs: int) -> Iterator[Row]:
-    """How well views are predicted by the others."""
+    """The error of predicted views, with the targets as built over the targets as drawn."""
     del runs
     for name, chosen in SETS.items():
         if name == "ov plane":

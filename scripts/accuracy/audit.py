@@ -1,7 +1,7 @@
-"""How often `audit` finds a fault that was planted in a foreign calibration, and how often it sees one in a sound one.
+"""How often `audit` finds a planted fault in a foreign calibration, and how often it reports one in a sound one.
 
-Each run: a camera over a field is calibrated by one set of observations and exported to OpenCV; its file is read back,
-with a fault or without, and audited against another set of as many. Exits with 1 when a figure is missed.
+Each run calibrates a camera above a field, exports it to OpenCV, reads the file back, with a fault or without, and
+audits it with a second set of as many observations. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ FAULTS: dict[str, Callable[[Camera], Camera]] = {
 
 
 def one_run(seed: int, fault: str | None, folder: Path) -> str | None:
-    """The cause that is found."""
+    """The cause that `audit` names; None where it finds none."""
     true = drawn(seed)
     scene = scene_of(true)
     few = dict.fromkeys(("k2", "p1", "p2", "k3"), 0.0) if fault == "too few coefficients" else {}
     options = replace(FREE, fixed=few)
     try:
         first = calibrate(simulate(scene, NOISE, seed=2 * seed).observations, options)
-    except CalibrationError:  # so few coefficients fold, say: no fault to plant
+    except CalibrationError:  # for example a lens that folds: there is no calibration to plant a fault in
         return one_run(seed + 100_000, fault, folder)
     faulty = FAULTS[fault](first.station()) if fault else first.station()
     written = calibration_of("this script", {"overhead": faulty}, first.targets)
@@ -91,7 +91,7 @@ def _causes(first: int, runs: int, fault: str | None) -> list[str | None]:
 
 
 def fault_rows(fault: str, runs: int) -> Iterator[Row]:
-    """Of one fault in so many calibrations."""
+    """Share of the calibrations with this fault in which it is found, and in which it is named correctly."""
     causes = _causes(1000, runs, fault)
     yield Row(fault, "found, share", float(np.mean([cause is not None for cause in causes])), least=1.0)
     named = causes.count(fault) / runs
@@ -99,7 +99,7 @@ def fault_rows(fault: str, runs: int) -> Iterator[Row]:
 
 
 def sound_rows(runs: int) -> Iterator[Row]:
-    """Of five times as many sound calibrations: as many as there are faulty ones."""
+    """False alarms in as many sound calibrations as there are faulty ones of all kinds."""
     runs *= len(FAULTS)
     alarms = sum(cause is not None for cause in _causes(5000, runs, None))
     yield Row("sound", "false alarms", alarms, np.sqrt(max(alarms, 1)), most=0.01 * runs, note=f"{runs} calibrations")

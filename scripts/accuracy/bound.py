@@ -1,4 +1,4 @@
-"""Calibrations beside the Cramer-Rao bound: what the noise allows, what one reaches who knows the truth, and ours."""
+"""Calibrations compared with the Cramer-Rao bound, and with the best estimate, for which the truth is known."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ from ceres_cal.simulate import CLEAN, Disturbance, Simulation, simulate
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One simulation of a problem: what is given to the calibration, and the truth of it.
+    """One simulation of a problem: the input of the calibration, and the truth.
 
     Attributes:
         observations: with each prior drawn from its own distribution around the truth.
-        clean: without noise, priors at the truth. used: the rows of `clean` that are neither outliers nor mislabelled.
+        clean: without noise, priors at the truth. used: selects the sights of `clean` that are neither outliers nor
+            mislabelled.
     """
 
     observations: Observations
@@ -41,7 +42,7 @@ class Trial:
     options: Options
 
     def problem(self, observations: Observations) -> least_squares.Problem:
-        """What somebody solves who knows every sigma, and which observations are wrong."""
+        """The least-squares problem with every sigma known and without the wrong observations."""
         return least_squares.Problem(
             self.used(gather_sights(observations, predicted=True)),
             make_layout(self.clean, self.options),
@@ -76,12 +77,12 @@ def true_estimate(simulation: Simulation, options: Options) -> Estimate:
 
 
 def bound(trial: Trial) -> Information:
-    """Information, at the truth, about everything shared: the inverse of the Cramer-Rao bound."""
+    """Information at the truth about everything shared; its inverse is the Cramer-Rao bound."""
     return reduced.information(trial.problem(trial.clean), trial.truth).shared
 
 
 def best(trial: Trial) -> Estimate:
-    """What somebody reaches who knows the truth to start from, every sigma, and which observations are wrong."""
+    """The estimate from a start at the truth, with every sigma known and without the wrong observations."""
     return bundle.solve(trial.problem(trial.observations), trial.truth).estimate
 
 
@@ -94,13 +95,13 @@ def difference(trial: Trial, estimate: Estimate) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Efficiency:
-    """Many calibrations of one problem beside its Cramer-Rao bound.
+    """Many calibrations of one problem, compared with its Cramer-Rao bound.
 
     Attributes:
         keys: (P) of the shared numbers. errors: (N, P) estimate less truth.
-        squared, best_squared: (N,) squared Mahalanobis length of the errors over P, of the calibration and of `best`:
-            1 on average where the bound is reached.
-        failed: runs that gave no calibration. rejected: observations taken out, on average.
+        squared, best_squared: (N,) squared Mahalanobis length of the errors over P, of the calibration and of `best`.
+            The mean is 1 where the bound is reached.
+        failed: number of runs without a calibration. rejected: mean number of rejected observations.
     """
 
     keys: tuple[Key, ...]
@@ -117,12 +118,12 @@ class Efficiency:
 
     @property
     def excess(self) -> tuple[float, float]:
-        """How much larger it is than that of `best` on the same noise, which spares most of the chance."""
+        """Mean difference to `best_squared`, which has the same noise, and its standard error."""
         return mean_and_error(self.squared - self.best_squared)
 
     @property
     def bias(self) -> tuple[float, str]:
-        """The farthest mean error in its own standard errors, and of what."""
+        """The largest mean error in its own standard errors, and the name of its number."""
         mean = np.mean(self.errors, axis=0)
         sigmas = np.abs(mean) / (np.std(self.errors, axis=0, ddof=1) / np.sqrt(len(self.errors)))
         return float(np.max(sigmas)), " ".join(self.keys[int(np.argmax(sigmas))][:3])
@@ -131,7 +132,7 @@ class Efficiency:
 def attempts(
     problem: Problem, disturbance: Disturbance, seeds: Sequence[int]
 ) -> Iterator[tuple[Trial, Calibration | None]]:
-    """A trial for each seed and its calibration from a cold start, None where that fails."""
+    """A trial for each seed and its calibration without an initial estimate, None where it fails."""
     return over(partial(_attempt, problem, disturbance), seeds)
 
 
@@ -144,7 +145,7 @@ def _attempt(problem: Problem, disturbance: Disturbance, seed: int) -> tuple[Tri
 
 
 def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int]) -> Efficiency:
-    """Calibrate the problem once per seed, from a cold start."""
+    """Calibrate the problem once per seed, without an initial estimate."""
     every = over(partial(_error_of, problem, disturbance), seeds)
     keys, errors, squared, best_squared, rejected = zip(*(one for one in every if one is not None), strict=True)
     return Efficiency(
@@ -160,7 +161,7 @@ def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int])
 def _error_of(
     problem: Problem, disturbance: Disturbance, seed: int
 ) -> tuple[tuple[Key, ...], Array, float, float, int] | None:
-    """Keys, errors, squared error, that of the best on this noise, and how many were taken out; None where it fails."""
+    """Keys, errors, squared error, that of `best` on the same noise, number of rejected rows; None where it fails."""
     trial, calibration = _attempt(problem, disturbance, seed)
     if calibration is None:
         return None

@@ -1,8 +1,8 @@
-"""How often `check` says that an unmoved camera has moved, and how small a move it finds: python scripts/run.py checks
+"""How often `check` reports a move of an unmoved camera, and how small a move it finds: python scripts/run.py checks
 
-The camera of `moves.py`, calibrated forty times over, is checked with line points: as before, with other noise,
-outliers and dependence, where the calibration was unlucky, hour by hour, and moved. "yes": the figure keeps to what is
-asked of it; "no": missed. Exits with 1 when a figure is missed.
+The camera of `moves.py` is calibrated 40 times and checked with line points: with the same kind of observations as in
+the calibration, with other noise, outliers and correlations, for the calibrations with the largest errors, every hour,
+and after a move. "yes": the limit is kept. "no": it is missed. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ceres_cal.simulate import Disturbance
 CALIBRATIONS = 40
 MONTH = 720  # hourly checks
 LINE_POINTS = 100
-REACH_M = 0.5  # over which errors of edges go together
+REACH_M = 0.5  # length over which errors of edges are correlated
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class Kind:
 
     name: str
     disturbance: Disturbance = DAY
-    sigma: float = 1.0  # times as stated
+    sigma: float = 1.0  # true noise over stated noise
     together: bool = False
     count: int = LINE_POINTS
 
     def seen(self, pose: Pose, seed: int) -> Observations:
-        """Such observations from a pose."""
+        """Observations of this kind from a pose."""
         simulation = seen(pose, self.disturbance, seed, spacing_m=0.12)
         observations = simulation.observations
         sigma_px = observations.curves.sigma_px / self.sigma
@@ -73,7 +73,7 @@ def _checked_by_turns(kind: Kind, number: int, first: int = 0, pose: Pose = HOME
 
 
 def false_case(runs: int) -> Iterator[Row]:
-    """False alarms of each kind of observations, over all calibrations."""
+    """False alarms for each kind of observations, over all calibrations."""
     for kind in KINDS:
         share = np.mean([not one.holds for one in over(partial(_checked_by_turns, kind), range(runs))])
         note = f"{runs} unmoved cases, {min(runs, CALIBRATIONS)} calibrations"
@@ -81,7 +81,7 @@ def false_case(runs: int) -> Iterator[Row]:
 
 
 def unlucky_case(runs: int) -> Iterator[Row]:
-    """The same given the calibration: of those whose tested numbers are farthest off; and over many checks."""
+    """False alarms given the calibration, for those with the smallest and the largest errors; also over many checks."""
     order = np.argsort([_off(calibration_of(number)) for number in range(CALIBRATIONS)])
     for what, some in (("the luckiest 20 of 40", order[:20]), ("the unluckiest 4 of 40", order[-4:])):
         each = max(runs // len(some), 1)
@@ -142,7 +142,7 @@ def _shifted(mm: float) -> Pose:
 
 
 def _smallest(kind: Kind, moved: Callable[[float], Pose], sizes: Sequence[float], runs: int) -> float:
-    """The smallest of the sizes that is found in 95 %, between two of them by a straight line in their logarithms."""
+    """The smallest size that is found in 95 % of the cases, interpolated linearly in the logarithm of the size."""
     before = 0.0
     for at, size in enumerate(sizes):
         one_of_them = partial(_checked_by_turns, kind, first=90_000, pose=moved(size))

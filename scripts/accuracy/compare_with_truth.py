@@ -1,6 +1,6 @@
-"""Shows a calibration beside its scene's truth: python scripts/run.py compare_with_truth CALIBRATION TRUTH
+"""Prints a calibration beside its scene's truth: python scripts/run.py compare_with_truth CALIBRATION TRUTH
 
-Exits with 1 when a station's map is off by more than 5 mm on average, on the floor or at robot height.
+Exits with 1 when a station's map has a mean error above 5 mm on the floor or at robot height.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MOST_MM = 5.0
 
 
 def true_cameras(truth: Mapping[str, Any]) -> dict[str, Camera]:
-    """The cameras, at no particular pose."""
+    """The cameras, without a pose."""
     cameras = {}
     for name, entry in truth["cameras"].items():
         lens = make_lens(entry["lens"]["kind"], entry["lens"].get("powers", (2, 3)), entry["lens"]["coefficients"])
@@ -44,14 +44,14 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def pose(camera: Camera) -> dict[str, float]:
-    """In the units that people read."""
+    """Position and Euler angles in mm and degrees."""
     angles = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
     names = ("x mm", "y mm", "z mm", "alpha deg", "beta deg", "gamma deg")
     return dict(zip(names, [*(1000.0 * camera.position).tolist(), *angles.tolist()], strict=True))
 
 
 def print_table(title: str, truth: Mapping[str, float], estimate: Mapping[str, float]) -> None:
-    """Truth beside estimate, of what both have: lenses may differ."""
+    """Truth beside estimate, for the numbers that both have, since the lenses may differ."""
     print(f"{title:22}{'truth':>16}{'estimate':>16}{'difference':>13}")
     for name in (name for name in truth if name in estimate):
         difference = estimate[name] - truth[name]
@@ -61,14 +61,14 @@ def print_table(title: str, truth: Mapping[str, float], estimate: Mapping[str, f
 
 
 def outline(target: Target) -> Array:
-    """x and y (N, 2) m of its points and of places along its curves."""
+    """x and y (N, 2) m of the target's points and of places along its curves."""
     curves = target.curves.values()
     along = [curve_points(curve, 0, 24) for curve in curves]
     return np.vstack([target.point_array, *along])[:, :2]
 
 
 def fields(truth_path: Path, file_names: Sequence[str]) -> dict[str, Array]:
-    """Lowest and highest x and y (2, 2) m of what each station sees lying in the world."""
+    """Lowest and highest x and y (2, 2) m of the targets without a placement that each station sees."""
     corners: dict[str, list[Array]] = {}
     for file_name in file_names:
         observations = Observations.load(truth_path.parent / file_name)
@@ -81,7 +81,7 @@ def fields(truth_path: Path, file_names: Sequence[str]) -> dict[str, Array]:
 
 
 def map_errors_mm(truth: Camera, estimate: Camera, field: Array, height_m: float) -> Array:
-    """How far off (N,) the estimate locates a grid of places over the part of the field that the image shows."""
+    """Errors (N,) with which the estimate locates a grid of places in the part of the field that the image shows."""
     x, y = (np.arange(low, high + 0.5 * STEP_M, STEP_M) for low, high in field.T)
     places = np.stack([*(axis.ravel() for axis in np.meshgrid(x, y)), np.full(len(x) * len(y), height_m)], axis=1)
     pixels = truth.project(places)
@@ -92,7 +92,7 @@ def map_errors_mm(truth: Camera, estimate: Camera, field: Array, height_m: float
 
 
 def compare(calibration_path: Path, truth_path: Path) -> int:
-    """Print the tables; 1 when a map is off by more than MOST_MM on average, else 0."""
+    """Print the tables; 1 when a map has a mean error above MOST_MM, else 0."""
     calibration = Calibration.load(calibration_path)
     truth = read_json(truth_path, TRUTH_FORMAT, TRUTH_VERSION)
     cameras, seen = true_cameras(truth), fields(truth_path, list(truth["files"]))
@@ -104,7 +104,7 @@ def compare(calibration_path: Path, truth_path: Path) -> int:
     means = [0.0]
     for name, estimate in calibration.stations.items():
         if estimate.cam_from_world == Pose.identity():
-            print(f"station {name}: it served as the world, boards alone do not tell where it stands")
+            print(f"station {name}: it is the origin of the world, since boards alone do not determine where it stands")
             continue
         entry = truth["stations"][name]
         true = cameras[entry["camera"]].at(Pose.looking(entry["position_m"], entry["rotation"]))
@@ -113,8 +113,8 @@ def compare(calibration_path: Path, truth_path: Path) -> int:
             errors = map_errors_mm(true, estimate, seen[name], height_m)
             means.append(float(np.mean(errors)))
             print(
-                f"  map at z = {height_m:.2f} m: off by {means[-1]:.2f} mm on average, {np.max(errors):.2f} mm at "
-                f"worst, over the {len(errors)} places of the field that the image shows"
+                f"  map at z = {height_m:.2f} m: mean error {means[-1]:.2f} mm, largest {np.max(errors):.2f} mm, "
+                f"over {len(errors)} places of the field that the image shows"
             )
     return 1 if max(means) > MOST_MM else 0
 

@@ -1,4 +1,4 @@
-"""What `constants.py` measures: small, fast scenes of which each says by some figures what a constant decided."""
+"""The measurements of `constants.py`: small, fast scenes whose figures show what a constant decides."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ Figures = dict[str, float]
 
 
 def _answer(attempt: Callable[[], object]) -> str:
-    """What an attempt refuses with, "" where it does not."""
+    """The message with which an attempt is refused, "" where it succeeds."""
     try:
         attempt()
     except CalibrationError as error:
@@ -77,7 +77,7 @@ def _answer(attempt: Callable[[], object]) -> str:
 
 
 def calibrations(runs: int, folder: Path) -> Figures:
-    """Error over the Cramer-Rao bound, poses left mirrored or lost, refusals that are right and that are not."""
+    """Error over the Cramer-Rao bound, poses left mirrored or lost, and right and wrong refusals."""
     figures: Figures = {}
     failed = 0
     for short, name, noise in (
@@ -99,7 +99,7 @@ def calibrations(runs: int, folder: Path) -> Figures:
 
 
 def _lost(seed: int) -> int:
-    """Boards, of 40, that end in a wrong pose: a fisheye's start loses some, and what is rejected pulls no more."""
+    """Number of the 40 boards that end in a wrong pose. Some are lost by the initial estimate of the fisheye."""
     cameras = {"camera": Camera((1280, 960), 400.0, (646.5, 473.8), KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)))}
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(9, 6, 0.05)
@@ -114,7 +114,7 @@ def _lost(seed: int) -> int:
 
 
 def _few_corners(runs: int) -> float:
-    """Root mean square error of all numbers, in stated sigmas, where 12 equations are spare."""
+    """Root mean square error of all numbers, in stated sigmas, with only 12 redundant equations."""
     pulls = []
     names = (*CORNERS, "LeftFieldLeftPenaltyCorner", "LeftFieldRightPenaltyCorner")
     for seed in range(runs):
@@ -126,17 +126,17 @@ def _few_corners(runs: int) -> float:
 
 
 def _shuffled(seed: int) -> Calibration:
-    """Boards whose corners bear one another's names."""
+    """Boards whose corners have permuted names."""
     seen_boards = simulate(PROBLEMS["boards, brown"]().scene, NOISE, seed).observations
     feature = np.random.default_rng(seed).permutation(seen_boards.points.feature)
     return calibrate(replace(seen_boards, points=replace(seen_boards.points, feature=feature)), Options(lens="brown"))
 
 
-# ---- what is known, and what to measure -----------------------------------------------------------------------------
+# ---- verdicts and advice --------------------------------------------------------------------------------------------
 
 
 def verdicts(runs: int, folder: Path) -> Figures:
-    """Coverage of 95 % intervals and shares of verdicts where phi and height trade off, and what is said of it."""
+    """Coverage of 95 % intervals, shares of verdicts where phi and height are correlated, and weak directions named."""
     figures: Figures = {}
     for tilt_deg in (0.0, 1.0, 3.0):
         held, words, known, sentences = [], [], [], 0
@@ -160,7 +160,7 @@ def verdicts(runs: int, folder: Path) -> Figures:
 
 
 def advice(runs: int, folder: Path) -> Figures:
-    """The advice: how many measurements are ranked, and the worst error that the one to follow leaves."""
+    """The advice: number of ranked measurements, and the worst error after the best one."""
     figures: Figures = {}
     for tilt_deg in (3.0, 8.0):
         promises, worst = [], []
@@ -178,7 +178,7 @@ def advice(runs: int, folder: Path) -> Figures:
 
 
 def diagnoses(runs: int, folder: Path) -> Figures:
-    """False alarms of `diagnose` on clean scenes, planted faults that are named, and what else is named beside them."""
+    """False alarms of `diagnose` on clean scenes, planted faults that are named, and other findings beside them."""
     alarms = others = named = 0
     each = max(runs // 3, 1)
     for problem in CLEAN.values():
@@ -199,7 +199,7 @@ def diagnoses(runs: int, folder: Path) -> Figures:
 
 
 def checks(runs: int, folder: Path) -> Figures:
-    """`check`: alarms of unmoved cameras, small moves found, and words on what is not understood."""
+    """`check`: alarms for unmoved cameras, small moves that are found, and `compare`: equal cameras that differ."""
     known = [calibrated(seed) for seed in range(4)]
 
     def share(pose: Pose, kind: int, count: int, camera: Camera = CAMERA) -> float:
@@ -227,7 +227,7 @@ def _turned(degrees: float) -> Pose:
 
 
 def refits(runs: int, folder: Path) -> Figures:
-    """`refit`: large moves, few observations, and what must be named instead."""
+    """`refit`: large moves, few observations, and changes that must be named as something else than a move."""
     known = [calibrated(seed) for seed in range(4)]
     good = refused = silent = 0
     for seed in range(2 * runs):
@@ -251,7 +251,7 @@ def refits(runs: int, folder: Path) -> Figures:
 
 
 def _named(make: Callable[[Calibration, int], Calibration], words: str, known: list[Calibration], runs: int) -> float:
-    """Share of refits that are refused in these words."""
+    """Share of refits that are refused with these words."""
     return sum(words in _answer(partial(make, known[seed % 4], seed)) for seed in range(runs)) / runs
 
 
@@ -266,7 +266,7 @@ def _four_corners(known: list[Calibration], runs: int) -> float:
 
 
 LEANING = overhead_pose(-2.3, -1.0, 3.9, tilt_y_deg=-15.0, yaw_deg=90.0)
-"""From straight above another zoom is another height."""
+"""From straight above, another zoom looks like another height, so this pose is tilted."""
 
 
 def _through(camera: Camera) -> Callable[[Calibration, int], Calibration]:
@@ -306,7 +306,7 @@ OTHER_STORIES: Mapping[str, tuple[Callable[[Calibration, int], Calibration], str
 
 
 def _shots(folder: Path, name: str, make: Callable[[int], Shot], count: int) -> Iterator[Shot]:
-    """Photographs, rendered once for all the settings that are measured in this folder."""
+    """Photographs, rendered once for all the settings that are measured with this folder."""
     for seed in range(count):
         path = folder / f"{name}-{seed}.pickle"
         if not path.exists():
@@ -316,7 +316,7 @@ def _shots(folder: Path, name: str, make: Callable[[int], Shot], count: int) -> 
 
 
 def lines(runs: int, folder: Path) -> Figures:
-    """Fields followed from starts near and far, and from clicks; how good the line centres are."""
+    """Fields followed from near and far initial cameras, and the accuracy of the line centres."""
     errors, pulls = [], []
     counts = dict.fromkeys(("missed", "behind robots", "arrived", "wrong without saying so"), 0)
     for seed, shot in enumerate(_shots(folder, "field", take, runs)):
@@ -347,7 +347,7 @@ def lines(runs: int, folder: Path) -> Figures:
 
 
 def auto(runs: int, folder: Path) -> Figures:
-    """Fields found without a start: right, wrong, missed; and what must not be found."""
+    """Fields found without an initial camera: right, wrong, missed; and cases in which none must be found."""
     shots = list(_shots(folder, "field", take, runs))
     what = [outcome(shot, FACING).what for shot in shots]
     few = max(runs // 4, 1)
@@ -365,7 +365,7 @@ def auto(runs: int, folder: Path) -> Figures:
 
 
 def boards(runs: int, folder: Path) -> Figures:
-    """Boards in photographs: how many corners are found, and how good they are."""
+    """Boards in photographs: number of corners found, and their accuracy."""
     board = checkerboard(9, 6, 0.1)
     stations = {"overhead": Station("overhead", HOME)}
     scene = board_scene(board, {"overhead": CAMERA}, stations, runs, seed=0)
@@ -397,7 +397,7 @@ def _corner_errors(found: Observations, truth: Observations) -> np.ndarray:
 
 
 def rings(runs: int, folder: Path) -> Figures:
-    """The paper's rings in photographs: rings found, and the polynomial from them."""
+    """The paper's rings in photographs: number of rings found, and the polynomial that is solved from them."""
     scene, _ = built_in_scene("rings-2004")
     camera, radii = scene.camera_at("overhead"), scene.targets["rings"].spec["radii_m"]
     assert isinstance(camera.lens, Radial)
@@ -421,7 +421,7 @@ def rings(runs: int, folder: Path) -> Figures:
 
 
 def from_clicks(runs: int, folder: Path) -> Figures:
-    """Starts from four rough clicks: followed to the right place, or not."""
+    """Initial cameras from four rough clicks: share that is followed to the right pose."""
     right = 0
     for seed, shot in enumerate(_shots(folder, "field", take, runs)):
         with suppress(CalibrationError):
@@ -432,7 +432,7 @@ def from_clicks(runs: int, folder: Path) -> Figures:
 
 
 def lenses(runs: int, _: Path) -> Figures:
-    """Of the lens that the data ask for."""
+    """How often the default lens choice recognises the true lens."""
     return {
         f"{name}, {scene}: recognised of {runs}": choices(scene, name, runs)[name]
         for scene in SCENES
@@ -454,4 +454,4 @@ FIGURES: Mapping[str, Callable[[int, Path], Figures]] = {
     "boards": boards,
     "rings": rings,
 }
-"""What a constant may touch -> its figures from a number of runs and a folder for pictures."""
+"""Group of constants -> its figures, from a number of runs and a folder for pictures."""

@@ -1,8 +1,8 @@
-"""Held-out error: calibrate on some frames, predict the others.
+"""Held-out error: calibrate with some frames and predict the others.
 
-A frame that is held out is predicted by cameras and stations of the others. A board that only held-out frames show is
-posed from them, everything else held: its six numbers are no part of the camera. So the error of boards is a little
-below that of a field, by the same share whatever the lens.
+A held-out frame is predicted with the cameras and stations of the other frames. A board that only held-out frames show
+needs a pose: its six numbers are fitted to these frames, with everything else fixed. Therefore the error of boards is a
+little lower than that of a field, by the same share for every lens.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ FOLDS = 5
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Errors of prediction, each observation by a calibration that did not see its frame.
+class PredictionErrors:
+    """Prediction errors; each observation is predicted by a calibration that did not use its frame.
 
     Attributes:
-        folds: into how many parts the frames went; failed_folds: those without which nothing usable came out: their
-            frames do not count. counted: observations that do.
-        points_rms_px: of the lengths of the points' errors; curves_rms_px: of distances to curves; rms_px, rms_mm: of
-            both, and on the targets' planes; NaN where there are none. fit_rms_px: of the calibration on all frames, on
-            the same observations.
+        folds: number of parts of the frames. failed_folds: parts without which the other frames cannot be calibrated;
+            their frames do not count. counted: number of observations that count.
+        points_rms_px: of the points' errors (lengths). curves_rms_px: of the distances to curves. rms_px, rms_mm: of
+            both, in the image and on the targets' planes; NaN where there are none. fit_rms_px: of the calibration with
+            all frames, for the same observations.
     """
 
     folds: int
@@ -58,15 +58,15 @@ def cross_validate(
     k: int = FOLDS,
     *,
     calibration: Calibration | None = None,
-) -> HeldOut:
+) -> PredictionErrors:
     """The error with which frames are predicted by a calibration of the others, k-fold.
 
     Args:
-        calibration: of all the observations with these options, where it is there already.
+        calibration: of all the observations with these options, if it exists already.
 
     Raises:
         InputError: k below 2, or fewer than two frames.
-        CalibrationError: the observations cannot be calibrated, as a whole or without each of most of the folds.
+        CalibrationError: the observations cannot be calibrated, as a whole or without more than half of the folds.
     """
     options = options or Options()
     whole = calibration or calibrate(observations, options)
@@ -93,7 +93,7 @@ def cross_validate(
     fit_px = _errors(whole.as_taken(observations), kept, whole.estimate)[kept, 0]
     points = kept & (np.arange(len(kept)) < len(observations.points))
     every = (errors[points, 0], errors[kept & ~points, 0], errors[kept, 0], errors[kept, 1], fit_px)
-    return HeldOut(folds, failed, int(np.count_nonzero(kept)), *map(rms, every))
+    return PredictionErrors(folds, failed, int(np.count_nonzero(kept)), *map(rms, every))
 
 
 def _attempt(observations: Observations, options: Options) -> Calibration | CalibrationError:
@@ -106,7 +106,7 @@ def _attempt(observations: Observations, options: Options) -> Calibration | Cali
 def _without(
     observations: Observations, options: Options, whole: Calibration, kept: Mask, part: Mask
 ) -> Array | CalibrationError:
-    """Errors (n, 2), px and mm, of a part's rows that count, by a calibration without it; or why there is none."""
+    """Errors (n, 2), px and mm, of the held-out inliers by a calibration without them, or the error that it raised."""
     trained = _attempt(observations.part(*np.split(~part, [len(observations.points)])), options)
     if isinstance(trained, CalibrationError):
         return trained
@@ -115,7 +115,7 @@ def _without(
 
 
 def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:
-    """Errors (N + M, 2), px and mm, of held-out observations under a calibration that did not see them."""
+    """Errors (N + M, 2), px and mm, of held-out observations under a calibration without them."""
     estimate, observations = trained.estimate, trained.as_taken(observations)
     sights = gather_sights(observations).used(*np.split(held, [len(observations.points)]))
     new = {key.placement for key in sights.keys if key.placement is not None} - set(estimate.placements)
@@ -131,7 +131,7 @@ def _predicted(observations: Observations, held: Mask, trained: Calibration, who
 
 
 def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observations: Observations) -> Mapping[str, Pose]:
-    """All placements, those of the sights in their best pose, everything else held; targets as the fold built them."""
+    """All placements; those of the sights are fitted with the rest fixed, with targets as the fold built them."""
     built = estimate.structure.built_into(sights)
     start = replace(estimate, structure=make_structure(observations.targets, {}))
     none = {name: np.empty(0, dtype=np.int64) for name in estimate.cameras}
@@ -142,8 +142,8 @@ def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observation
 
 
 def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array:
-    """Lengths in px and mm of the residuals, (N + M, 2); what is not seen counts 10 sigma in px, NaN in mm."""
-    unseen_sigma = 10.0  # what an observation counts that the fold's camera cannot show at all
+    """Residuals in px and mm, (N + M, 2). A point that the camera cannot show counts 10 sigma in px and NaN in mm."""
+    unseen_sigma = 10.0  # residual of an observation that the fold's camera cannot show
     sights = gather_sights(observations).used(*np.split(rows, [len(observations.points)]))
     there = residuals(sights, estimate)
     equations = write_equations(sights, estimate, there)

@@ -1,11 +1,11 @@
-"""What somebody meets who states nothing: python scripts/run.py defaults [--help]
+"""Accuracy of calibrations with default options: python scripts/run.py defaults [--help]
 
-Scenes of one camera over a division B field, calibrated by the defaults. Its lens is Brown's, with decentring that is
-drawn from the range of real lenses, or the paper's, without any. Of the first: how often 95 % intervals of places at
-0 and 150 mm hold (90 to 99 % asked), and that no number called "known" is over 5 standard deviations off. Of the
-second: what the default costs, as the error at 150 mm over that of the named lens. Then a stated height or phi that is
-5 % or 2 % wrong, and ones that are right, and fields that are longer or wider than their drawing: how often that is
-named. Exits with 1 when a figure is missed by more than two of its standard errors.
+Scenes of one camera above a division B field are calibrated with the default options. Brown's lens has decentring drawn
+from the range of real lenses; the paper's lens has none. With Brown's lens: how often the 95 % intervals of places at 0
+and 150 mm contain the truth (90 to 99 % required), and whether any number called "known" has an error above 5 standard
+deviations. With the paper's lens: the error at 150 mm over that with the lens stated. Then how often a contradiction is
+reported: for a stated height or phi that is wrong by some per cent, for correct ones, and for fields that are longer or
+wider than their drawing. Exits with 1 when a figure is missed by more than two standard errors.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _round(rng: np.random.Generator) -> tuple[float, Lens]:
 
 
 def _scene(seed: int, lens: _Drawn, tilts_deg: tuple[float, ...], middle_m: float = 0.0, boards: int = 0) -> Scene:
-    """A camera 4.2 m over a place of the field, once at each tilt, and boards before it."""
+    """A camera 4.2 m above a place of the field, once at each tilt; with boards in front of the first station."""
     rng = np.random.default_rng([seed, 34])
     phi, model = lens(rng)
     centre = (639.5 + rng.normal(0.0, 10.0), 479.5 + rng.normal(0.0, 10.0))
@@ -81,14 +81,14 @@ DECENTRED: dict[str, tuple[_Maker, int]] = {
 
 
 def observed(scene: Scene, frames: int, seed: int) -> Observations:
-    """What is seen of a scene, in so many frames: the same places of it, as one frame with less noise."""
+    """Observations of a scene in so many frames, simulated as one frame with less noise."""
     sigma_px = _NOISE_PX / frames**0.5
     return simulate(scene, Disturbance(sigma_px, sigma_px), seed).observations
 
 
 @dataclass
 class RunResult:
-    """Of one run: which intervals hold, by height, how far the farthest known number is off, and how it is headed."""
+    """One run: which intervals contain the truth, the largest error of a "known" number, the verdict's level."""
 
     held: dict[float, Mask] = field(default_factory=dict)
     sigmas: float = 0.0
@@ -98,7 +98,7 @@ class RunResult:
 
 
 def _located(calibration: Calibration, scene: Scene, height_m: float) -> Iterator[tuple[Array, Array, Array]]:
-    """By how much places are located elsewhere, and the ends of their intervals."""
+    """Errors of located places, and the ends of their intervals relative to the truth."""
     for station in scene.stations:
         camera = scene.camera_at(station)
         places = np.column_stack([_PLACES, np.full(len(_PLACES), height_m)])
@@ -124,7 +124,7 @@ def _decentred(maker: _Maker, frames: int, seed: int) -> RunResult:
 
 
 def decentred(name: str, runs: int) -> Iterator[Row]:
-    """The figures of a lens that is decentred."""
+    """The figures for a lens with decentring."""
     every = list(over(partial(_decentred, *DECENTRED[name]), range(runs)))
     done = [one for one in every if not one.failed]
     yield Row(name, "runs without a calibration", sum(one.failed for one in every), most=0.0)
@@ -151,7 +151,7 @@ def _costs(tilt_deg: float, seed: int) -> tuple[float, float, bool]:
 
 
 def round_lens(runs: int) -> Iterator[Row]:
-    """What the default costs where the lens is the paper's."""
+    """What the default lens choice costs if the true lens is the paper's."""
     for tilt_deg in (3.0, 12.0, 20.0):
         named, auto, paper = np.array(list(over(partial(_costs, tilt_deg), range(runs))), dtype=float).T
         name = f"the paper's lens, {tilt_deg:g} deg"
@@ -161,8 +161,8 @@ def round_lens(runs: int) -> Iterator[Row]:
 
 
 def _accused(quantity: str, off: float, tilt_deg: float, seed: int) -> tuple[bool, bool, float]:
-    """Whether a stated height or phi is said to be contradicted, whether that or that it may be wrong, and by how many
-    standard deviations what the true lens alone says contradicts it.
+    """Whether a stated height or phi is reported as contradicted, whether it is reported as contradicted or doubtful,
+    and by how many standard deviations the observations alone, with the true lens, contradict it.
     """
     lens = "brown" if seed % 2 else "radial"
     scene = _scene(seed, _brown if seed % 2 else _round, (tilt_deg,))
@@ -182,7 +182,7 @@ def _accused(quantity: str, off: float, tilt_deg: float, seed: int) -> tuple[boo
     return named, named or any(f"stated {quantity}" in said for said in calibration.warnings), apart
 
 
-_TAPED_M, _OF_PHI = 0.005, 0.002  # standard deviations of a stated height, and of a stated phi, of itself
+_TAPED_M, _OF_PHI = 0.005, 0.002  # standard deviations of a stated height, m, and of a stated phi, relative
 _WRONG = (
     ("height", 0.05, 12.0, 0.95, 1.0),
     ("height", 0.05, 20.0, 0.95, 1.0),
@@ -192,11 +192,11 @@ _WRONG = (
     ("phi", 0.05, 20.0, 0.95, 1.0),
     ("phi", 0.0, 12.0, 0.0, 0.005),
 )
-"""What is stated, by how much it is wrong, the tilt, deg, and how often a contradiction may be named."""
+"""Stated quantity, its relative error, the tilt in degrees, and least and most share of runs with a contradiction."""
 
 
 def stated(runs: int) -> Iterator[Row]:
-    """How often a stated height or phi is said to be contradicted."""
+    """How often a contradiction of a stated height or phi is reported."""
     for quantity, off, tilt_deg, least, most in _WRONG:
         named, said, apart = zip(*over(partial(_accused, quantity, off, tilt_deg), range(runs)), strict=True)
         name = f"a {quantity} {100.0 * off:g} % wrong, {tilt_deg:g} deg" if off else f"a {quantity} that is right"
@@ -207,8 +207,8 @@ def stated(runs: int) -> Iterator[Row]:
 
 
 def _drawn(dimension: str, off: float, tilt_deg: float, seed: int) -> tuple[bool, bool, bool]:
-    """Of a field that is drawn with another length: whether that is named, whether it or another length is, and whether
-    the calibration is called trusted.
+    """For a field drawn with a wrong length: whether this length is named, whether any length is named, and whether the
+    calibration is called trusted.
     """
     observations = observed(_scene(seed, _brown if seed % 2 else _round, (tilt_deg,)), 1, seed)
     field = observations.targets["field"]
@@ -218,14 +218,14 @@ def _drawn(dimension: str, off: float, tilt_deg: float, seed: int) -> tuple[bool
         quality = quality_of(calibrate(observations), observations)
     except CalibrationError as error:
         return dimension in str(error), True, False
-    # A finding names beside itself what these data do not distinguish it from.
+    # A finding also names the causes that these data do not distinguish from it.
     said = " ".join(one.sentence for one in (quality.diagnosis.findings if quality.diagnosis else ()))
     other = any(f"field/{one}" in said for one in field.dimensions)
     return f"field/{dimension}" in said, other, judge_quality(quality).level == "good"
 
 
 def lengths(runs: int) -> Iterator[Row]:
-    """How often a field that is drawn otherwise than it is painted is found out."""
+    """How often a field that differs from its drawing is reported."""
     for off, tilt_deg in ((0.02, 7.0), (0.02, 12.0), (0.02, 20.0), (0.01, 12.0), (0.0, 12.0)):
         for dimension in ("field_length_m", "field_width_m")[: 2 if off else 1]:
             own, some, trusted = np.mean(list(over(partial(_drawn, dimension, off, tilt_deg), range(runs))), axis=0)

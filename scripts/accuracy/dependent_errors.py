@@ -1,4 +1,4 @@
-"""Errors that go together, to be put onto simulated observations: for `intervals.py`."""
+"""Correlated errors for simulated observations, used by `intervals.py`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ceres_cal.simulate import Scene
 
 Errors = Callable[[Observations, Scene, int], Observations]
 SIGMA_PX = 0.3
-_FEWEST = 8  # observations of a line that is put aside
+_FEWEST = 8  # observations of a line that is displaced
 
 
 def along_lines(observations: Observations, scene: Scene, seed: int, length_m: float) -> Observations:
-    """Errors of curve observations, in x and y, that go together over a length along each curve of each view."""
+    """Errors of curve observations, in x and y, correlated along each curve of each view with the given length."""
     rng, pixels = np.random.default_rng([seed, 77]), np.array(observations.curves.pixels)
     for rows in _curves(observations):
         places = _places(observations, scene, rows)
@@ -28,7 +28,7 @@ def along_lines(observations: Observations, scene: Scene, seed: int, length_m: f
 
 
 def line_aside(observations: Observations, scene: Scene, seed: int, aside_px: float) -> Observations:
-    """One whole curve of the first frame that is seen aside, and independent errors."""
+    """One whole curve of the first frame that is seen displaced, and independent errors."""
     rng, pixels = np.random.default_rng([seed, 9]), np.array(observations.curves.pixels)
     rows = rng.choice(np.array([r for r in _curves(observations) if len(r) >= _FEWEST], dtype=object))
     rows = np.asarray(rows, dtype=np.int64)
@@ -41,7 +41,7 @@ def line_aside(observations: Observations, scene: Scene, seed: int, aside_px: fl
 
 
 def warped(observations: Observations, scene: Scene, seed: int, sigma_px: float, views: int | None) -> Observations:
-    """A smooth error over each of the first boards, of this root mean square: a random cubic in x and y."""
+    """A smooth error over each of the first boards with this root mean square: a random cubic in x and y."""
     del scene
     rng, pixels, points = np.random.default_rng([seed, 3]), np.array(observations.points.pixels), observations.points
     for number, view in enumerate(observations.views[:views]):
@@ -54,7 +54,7 @@ def warped(observations: Observations, scene: Scene, seed: int, sigma_px: float,
 
 
 def in_rows(observations: Observations, scene: Scene, seed: int) -> Observations:
-    """Errors that all corners in one row of a board share."""
+    """Errors that all corners in one row of a board have in common."""
     del scene
     rng, pixels, points = np.random.default_rng([seed, 4]), np.array(observations.points.pixels), observations.points
     for number, view in enumerate(observations.views):

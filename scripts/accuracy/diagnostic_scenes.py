@@ -1,4 +1,4 @@
-"""Scenes for the diagnostics: clean ones of every kind, and the same with one fault planted."""
+"""Scenes for the diagnostics: correct ones of every kind, and the same scenes with one fault."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ USUAL: Lens = Radial((-5.2e-5, 6.1e-7), (2, 3))
 def overhead(
     lens: Lens = USUAL, frames: int = 10, boards: int = 6, phi: float = 868.0, height_m: float = 4.02
 ) -> Scene:
-    """One station over half of a division B field, leaning by 8 degrees, and a board at some places."""
+    """One station above half of a division B field, tilted by 7 degrees, and a board at some places."""
     cameras = {"overhead": Camera((1280, 960), 868.0, (646.5, 473.8), lens)}
     pose = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=6.8, tilt_y_deg=-2.4, yaw_deg=90.6)
     stations = {"overhead": Station("overhead", pose)}
@@ -38,7 +38,7 @@ def overhead(
 
 
 def held_boards(lens: Lens, phi: float = 868.0, count: int = 12) -> Scene:
-    """A board held before one camera."""
+    """A board held in front of one camera at some places."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
     return board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=BoardRanges((0.5, 1.5)))
@@ -46,7 +46,7 @@ def held_boards(lens: Lens, phi: float = 868.0, count: int = 12) -> Scene:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is calibrated: the observations of a seed, and the options."""
+    """Observations for a seed, and the options of the calibration."""
 
     observe: Callable[[int], Observations]
     options: Options
@@ -82,7 +82,7 @@ CLEAN: dict[str, Problem] = {
     "two cameras, shared boards": _plain(lambda: built_in_scene("two-cameras")[0]),
     "three stations": _plain(lambda: built_in_scene("moved-camera")[0]),
 }
-"""Data that are just what the model says."""
+"""Data that agree with the model."""
 
 
 # ---- faults ---------------------------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def longer_polynomial(seed: int) -> Observations:
 
 
 def line_aside(seed: int, line: str = "LeftPenaltyStretch", aside_m: float = 0.012) -> Observations:
-    """One line painted to its left, everything named as it is drawn."""
+    """One line painted to the left of its drawn place; the target is the drawing."""
     scene, drawn = overhead(), ssl_field("B")
     curve = drawn.curves[line]
     assert isinstance(curve, Segment)
@@ -114,7 +114,7 @@ def line_aside(seed: int, line: str = "LeftPenaltyStretch", aside_m: float = 0.0
 
 
 def wrong_label(seed: int) -> Observations:
-    """In frame 3 one corner under the name of another."""
+    """In frame 3 one corner has the name of another."""
     seen = simulate(overhead(), NOISE, seed).observations
     names = seen.targets["field"].point_names
     feature = seen.points.feature.copy()
@@ -126,7 +126,7 @@ def wrong_label(seed: int) -> Observations:
 
 
 def bumped(seed: int, degrees: tuple[float, float, float] = (0.05, 0.0, 0.0), frames: int = 5) -> Observations:
-    """After frame 5 the camera has turned in place about its own axes."""
+    """After frame 5 the camera is rotated in place about its own axes."""
     scene = overhead()
     station = scene.stations["overhead"]
     turned = Pose.exp((*np.deg2rad(degrees), 0.0, 0.0, 0.0)) @ station.cam_from_world
@@ -147,7 +147,7 @@ def noisier(seed: int) -> Observations:
 
 
 def agreeing(seed: int) -> Observations:
-    """Curve observations whose neighbours share half of their variance."""
+    """Curve observations whose errors are correlated between neighbours (coefficient 0.5)."""
     seen = simulate(overhead(), NOISE, seed).observations
     rng = np.random.default_rng(seed)
     pixels = simulate(overhead(), Disturbance(), seed).observations.curves.pixels
@@ -158,7 +158,7 @@ def agreeing(seed: int) -> Observations:
 
 
 def _displaced(seed: int, shift: Callable[[Array], Array]) -> Observations:
-    """Every pixel where a displacement (N, 2) of its offsets from the principal point puts it."""
+    """Every pixel moved by a displacement (N, 2), a function of its offset from the principal point."""
     seen = simulate(overhead(), NOISE, seed).observations
     middle = overhead().cameras["overhead"].principal_point
     points, curves = (
@@ -169,12 +169,12 @@ def _displaced(seed: int, shift: Callable[[Array], Array]) -> Observations:
 
 
 def skewed(seed: int) -> Observations:
-    """Pixels whose axes lean by 4 mrad."""
+    """Pixels whose axes are skewed by 4 mrad."""
     return _displaced(seed, lambda away: away[:, 1:] * (0.004, 0.0))
 
 
 def decentred(seed: int) -> Observations:
-    """Brown's tangential displacement, 1 px at half the image diagonal, before a lens that has none."""
+    """Brown's tangential displacement, 1 px at half the image diagonal, for a lens model that has none."""
 
     def shift(away: Array) -> Array:
         x, y = away.T / 800.0
@@ -184,7 +184,7 @@ def decentred(seed: int) -> Observations:
 
 
 def _on_floor(seed: int, height_m: Callable[[Array], Array]) -> Observations:
-    """The field on a floor of this height (N,) at places (N, 2)."""
+    """The field on a floor whose height (N,) is a function of places (N, 2)."""
     scene = overhead()
     seen = simulate(scene, NOISE, seed).observations
     camera, drawn = scene.camera_at("overhead"), scene.targets["field"]
@@ -199,13 +199,13 @@ def _on_floor(seed: int, height_m: Callable[[Array], Array]) -> Observations:
 
 
 def _on_ground(camera: Camera, pixels: Array) -> Array:
-    """(N, 3) where rays meet z = 0."""
+    """(N, 3) where rays meet the plane z = 0."""
     rays = camera.rays(pixels) @ camera.cam_from_world.rotation
     return np.asarray(camera.position - rays * (camera.position[2] / rays[:, 2:]))
 
 
 def bowed_floor(seed: int) -> Observations:
-    """A floor that is 15 mm lower at the ends of the half that is seen."""
+    """A floor that is 15 mm lower at both ends of the half that is seen."""
     return _on_floor(seed, lambda place: -0.015 * ((place[:, 0] + 2.25) / 2.25) ** 2)
 
 
@@ -215,7 +215,7 @@ def bump(seed: int) -> Observations:
 
 
 def drawn_longer(seed: int) -> Observations:
-    """A field that is drawn 45 mm longer than it is painted."""
+    """A field whose drawing is 45 mm longer than the painted field."""
     seen = simulate(overhead(), NOISE, seed).observations
     return replace(seen, targets={**seen.targets, "field": ssl_field("B", field_length_m=9.045)})
 

@@ -1,8 +1,8 @@
-"""What the diagnostics find where nothing is wrong, and where one thing is: python scripts/run.py false_alarms [--help]
+"""Findings of the diagnostics for correct scenes and for scenes with one fault: python scripts/run.py false_alarms
 
-Every finding on a clean scene is a false alarm; their share of the scenes must keep to the stated rate. On a scene with
-one planted fault the largest finding must name it; any other finding there is counted too. Exits with 1 when the rate
-is exceeded by more than chance allows, or a fault is not named. --time measures `ceres-cal diagnose` on 100 000
+Every finding for a correct scene is a false alarm; their share of the scenes must keep to the stated rate. For a scene
+with one fault, the largest finding must name it; any other finding is counted too. Exits with 1 when the rate is
+exceeded by more than chance allows, or a fault is not named. --time measures `ceres-cal diagnose` with 100 000
 observations instead, as a whole process.
 """
 
@@ -29,12 +29,12 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.simulate import simulate
 
 MOST_SECONDS = 5.0
-SURE = 0.001  # a count of false alarms less probable than this exceeds the rate
+SURE = 0.001  # with a smaller probability of so many false alarms, the stated rate is exceeded
 
 
 @dataclass(frozen=True)
 class Tally:
-    """One kind of scene: how many, in how many of them there was a (false) finding, and which."""
+    """One kind of scene: number of scenes, number of scenes with a (false) finding, and the kinds of the findings."""
 
     name: str
     scenes: int
@@ -43,7 +43,7 @@ class Tally:
     named: int | None = None
 
     def rows(self) -> Iterator[Row]:
-        """As figures: faults named, or the probability of so many false alarms at the stated rate."""
+        """The figures: share of faults named, and the probability of so many false alarms at the stated rate."""
         if self.named is not None:
             yield Row(self.name, "named, share", self.named / self.scenes, least=1.0)
         chance = _chance(self.alarms, self.scenes) if self.alarms else 1.0
@@ -81,7 +81,7 @@ def clean_tally(name: str, seeds: range) -> Tally:
 
 
 def fault_tally(name: str, seeds: range) -> Tally:
-    """A scene counts as named when the finding of most effect is of the planted kind and subject."""
+    """A fault counts as named when the finding with the largest effect has its kind and subject."""
     _, kind, subject = FAULTS[name]
     named, alarms, kinds = 0, 0, Counter[str]()
     for findings in over(partial(_found, name), seeds):
@@ -93,7 +93,7 @@ def fault_tally(name: str, seeds: range) -> Tally:
 
 
 def process_rows(_: int) -> Iterator[Row]:
-    """How long the command takes on many observations: boards and a lens one power too short, cache warm."""
+    """Time of the command with many observations: boards, and a lens with one power too few."""
     observations = simulate(held_boards(USUAL, count=1860), NOISE, 1).observations
     with tempfile.TemporaryDirectory() as folder:
         names = [str(Path(folder) / name) for name in ("calibration.json", "observations.json")]
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for number, name in enumerate([*CLEAN, *FAULTS]):
             if name in (given.case or (name,)):
                 make, count = (clean_tally, given.runs) if name in CLEAN else (fault_tally, given.faults)
-                first = given.seed + 1000 * number  # one draw of noise before two lenses is no two draws
+                first = given.seed + 1000 * number  # scenes of different kinds get different noise
                 tallies.append(make(name, range(first, first + count)))
                 if given.json != "-":
                     print(tallies[-1], flush=True)

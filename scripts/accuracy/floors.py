@@ -1,9 +1,10 @@
-"""Floors that are not as drawn, of a single picture: python scripts/run.py floors [--help]
+"""Floors that differ from their drawing, in a single picture: python scripts/run.py floors [--help]
 
-One camera over a division B field, tilted by 8 and 20 degrees, calibrated by the defaults: over a flat floor, over one
-that bows by 5 mm, and with a field whose sides lie 5 mm out of square. How far places are off at the floor and at 150
-mm, over the standard deviation that is stated: 1 where the statement is honest. A single picture cannot tell these
-floors, so the prior `FLOOR_OFF` decides: .4 to 1 of a flat one, at most 2.5 of one that is two of its sizes off.
+One camera above a division B field, tilted by 8 and 20 degrees, calibrated with the default options. The floor is flat,
+or bowed by 5 mm, or the field's sides are 5 mm out of square. Printed is the error of places at the floor and at 150 mm
+over the stated standard deviation; 1 where the statement is honest. A single picture does not determine such a floor,
+so the prior `FLOOR_OFF` decides: 0.4 to 1.1 is required for a flat floor, at most 2.5 for the others, which are two of
+its sigmas off.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _TILTS_DEG = (8.0, 20.0)
 _MARGIN_PX = 20.0
 _PLACES = np.array([[x, y] for x in np.linspace(-2.5, 2.5, 11) for y in np.linspace(-2.0, 2.0, 9)])
 _Moved = Callable[[Array, Array], Array]
-"""Places (N, 3) of a flat floor, and three random numbers -> where they are."""
+"""Places (N, 3) of a flat floor, and three random numbers -> the places of the other floor."""
 
 
 def _flat(places: Array, _: Array) -> Array:
@@ -55,7 +56,7 @@ FLOORS: Mapping[str, tuple[_Moved, float, float]] = {
 
 
 def _seen(observations: Observations, camera: Camera, moved: _Moved, amounts: Array) -> Observations:
-    """The observations of a floor that is another one."""
+    """The observations with the flat floor replaced by another one."""
 
     def of(pixels: Array) -> Array:
         places = np.column_stack([camera.locate(pixels, 0.0), np.zeros(len(pixels))])
@@ -70,7 +71,7 @@ def _seen(observations: Observations, camera: Camera, moved: _Moved, amounts: Ar
 
 
 def _squares(floor: str, tilt_deg: float, seed: int) -> tuple[float, ...]:
-    """Mean squares of errors over what is stated, at each of HEIGHTS_M."""
+    """Mean squares of errors over stated standard deviations, at each of HEIGHTS_M."""
     rng = np.random.default_rng([seed, int(tilt_deg)])
     scene = scene_of(SetUp(1, tilt_deg, AUTO, False, False), rng)
     (name,) = scene.stations

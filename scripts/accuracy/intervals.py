@@ -1,9 +1,9 @@
-"""Whether stated uncertainty is honest, over many simulated calibrations: python scripts/run.py intervals [--help]
+"""Whether stated uncertainties are honest, over many simulated calibrations: python scripts/run.py intervals [--help]
 
 For each problem: how often the stated 95 % intervals of the parameters, and of points located at 0 and 150 mm, contain
-the truth, over all of them (93 to 97 % asked) and for the parameter that does worst (91 % asked); and how often the
-verdicts are those that were built in. Where errors go together 90 to 98 % are asked, and no number called "known" more
-than five of its standard deviations off. Exits with 1 when a figure is missed by more than two of its standard errors.
+the truth, for all of them (93 to 97 % required) and for the worst parameter (91 % required); and how often the verdicts
+are the expected ones. For correlated errors 90 to 98 % are required, and no number called "known" may have an error
+above five standard deviations. Exits with 1 when a figure is missed by more than two standard errors.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ WEAKLY, BADLY = frozenset({"weak"}), frozenset({"unknown"})
 EITHER = frozenset({"known", "weak", "unknown"})
 LEAST, MOST, LEAST_PARAMETER = 0.93, 0.97, 0.91
 LEAST_TOGETHER, MOST_TOGETHER, FAR = 0.90, 0.98, 5.0
-LEAST_VERDICTS = 0.9  # sigma itself varies from run to run, and a verdict near a threshold with it
+LEAST_VERDICTS = 0.9  # sigma varies from run to run, and so does a verdict that is near a threshold
 _PLACES = np.array([[x, y] for x in (-4.0, -2.0, 0.0, 2.0, 4.0) for y in (-2.8, -1.0, 1.0, 2.8)])
 
 
 @dataclass(frozen=True)
 class Case:
-    """One problem, and what the verdicts on phi and height must be in it."""
+    """One problem, and the expected verdicts on phi and height."""
 
     make: partial[Problem]
     expected: frozenset[str] = frozenset({"known"})
@@ -48,7 +48,7 @@ class Case:
 
     @property
     def limits(self) -> tuple[float, float, float]:
-        """Least and most coverage, and the least of any parameter."""
+        """Least and most coverage, and the least coverage of any parameter."""
         return (LEAST, MOST, LEAST_PARAMETER) if self.errors is None else (LEAST_TOGETHER, MOST_TOGETHER, 0.0)
 
 
@@ -91,14 +91,14 @@ for _name, _errors in {
 
 @dataclass
 class Coverage:
-    """What was contained, run by run.
+    """Which intervals contain the truth, run by run.
 
     Attributes:
         names: (P) of the parameters. parameters: (runs, P), placements: (runs, 6 S), points: height -> (runs, 2 N):
-            whether the interval held the truth; open: the same shape as points, whether it is infinite.
-        verdicts: (runs, V) whether they are those built in. failed: runs without a calibration.
-        far: numbers called "known" that are farther off than FAR standard deviations. factors: (runs, P) standard
-            deviations over those by the model alone.
+            whether the interval contains the truth. open: of the shape of points, whether the interval is infinite.
+        verdicts: (runs, V) whether they are the expected ones. failed: runs without a calibration.
+        far: number of numbers called "known" with an error above FAR standard deviations.
+        factors: (runs, P) standard deviations over those of the model alone.
     """
 
     names: tuple[str, ...] = ()

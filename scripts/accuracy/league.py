@@ -1,11 +1,10 @@
-"""The league's set-ups, calibrated one by one: python scripts/run.py league [--help]
+"""The set-ups of the league, calibrated one by one: python scripts/run.py league [--help]
 
-1, 2 and 4 cameras over a division B field; tilts of 0, 1, 3, 8 and 20 degrees; the lens chosen or named; with and
-without boards; with and without the height measured by tape (to 10 mm). Right is an answer, or one line that refuses;
-no warning of NumPy, at most five seconds of processor time, no number that is called "known" over 5 standard
-deviations off, no place over 2.5 of its stated 95 % radii off, no floor of which half is not known to 20 mm, and no
-standard deviation above that of its own prior.
-Exits with 1 where anything else comes out.
+1, 2 and 4 cameras above a division B field; tilts of 0, 1, 3, 8 and 20 degrees; the lens chosen or stated; with and
+without boards; with and without a height measured to 10 mm. A result is correct if it is a calibration or a refusal of
+one line, without a warning of NumPy, within five seconds of processor time. No number called "known" may have an error
+above 5 standard deviations, no place an error above 2.5 of its stated 95 % radii. The median standard deviation of the
+floor must be below 20 mm, and no standard deviation may exceed that of its own prior. Exits with 1 otherwise.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 MOST_SECONDS, MOST_FLOOR_MM = 5.0, 20.0
 NOISE_PX, TAPE_M = 0.3, 0.01
 _BOARD, _BOARDS = checkerboard(9, 6, 0.1), 5
-# Cameras -> where they hang (x, y), and how high, m: each sees its part of the field of 9 x 6 m and some of the next.
+# Cameras -> their places (x, y) and their height, m: each sees its part of the field of 9 x 6 m and some of the next.
 _PLACES = {
     1: (((0.0, 0.0),), 5.2),
     2: (((-2.3, 0.0), (2.3, 0.0)), 4.4),
@@ -63,7 +62,7 @@ SET_UPS = [SetUp(*one) for one in product(*_FACTORS)]
 
 
 def pairwise() -> list[SetUp]:
-    """Some of them, in which each two values of two factors come together; fewer cameras first."""
+    """Set-ups in which each two values of two factors occur together; those with fewer cameras first."""
     missing = {pair for one in SET_UPS for pair in combinations(enumerate(one), 2)}
     chosen = []
     while missing:
@@ -75,10 +74,10 @@ def pairwise() -> list[SetUp]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of one.
+    """The result of one set-up.
 
     Attributes:
-        refused: the message, where there was no answer. fault: what is wrong with what came out, "" where nothing is.
+        refused: the message of a refusal, "" otherwise. fault: what is wrong with the result, "" where nothing is.
         seconds: of processor time.
     """
 
@@ -90,7 +89,7 @@ class Outcome:
 
 
 def scene_of(set_up: SetUp, rng: np.random.Generator) -> Scene:
-    """The scene: the lens is what it is calibrated for, or one of the two where that is chosen."""
+    """The scene: its lens is the stated one, or one of the two kinds where the lens is chosen."""
     places, height_m = _PLACES[set_up.cameras]
     lens = set_up.lens if set_up.lens != AUTO else str(rng.choice(["radial", "brown"]))
     phi, model = LENSES[lens](rng)
@@ -116,7 +115,7 @@ def scene_of(set_up: SetUp, rng: np.random.Generator) -> Scene:
 
 
 def outcome(set_up: SetUp, seed: int, most_seconds: float = MOST_SECONDS) -> Outcome:
-    """Calibrate one; the same set-up and seed give the same."""
+    """Calibrate one scene; the same set-up and seed give the same scene."""
     rng = np.random.default_rng([seed, SET_UPS.index(set_up)])
     scene = scene_of(set_up, rng)
     priors: tuple[Prior, ...] = ()
@@ -144,7 +143,7 @@ def outcome(set_up: SetUp, seed: int, most_seconds: float = MOST_SECONDS) -> Out
 
 
 def _fault(calibration: Calibration, scene: Scene, priors: Sequence[Prior]) -> str:
-    """What is wrong with an answer; "" where nothing is."""
+    """What is wrong with a calibration; "" where nothing is."""
     sigmas, which, radii = farthest(calibration, scene)
     if sigmas > MOST_SIGMAS:
         return f"{which} is called known, {sigmas:.1f} sd off"
@@ -163,7 +162,7 @@ def _fault(calibration: Calibration, scene: Scene, priors: Sequence[Prior]) -> s
 
 
 def outcomes(set_ups: Sequence[SetUp], runs: int, first: int) -> Iterator[Outcome]:
-    """Each set-up with `runs` seeds; what is wrong is printed at once."""
+    """Each set-up with `runs` seeds; faults are printed immediately."""
     for seed in range(first, first + runs):
         for set_up in set_ups:
             one = outcome(set_up, seed)

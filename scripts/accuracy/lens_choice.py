@@ -1,8 +1,8 @@
-"""Which lens the data are said to ask for, of scenes whose lens is known: python scripts/run.py lens_choice [--help]
+"""Which lens the default choice takes for scenes with a known lens: python scripts/run.py lens_choice [--help]
 
-Radial (2, 3) must be recognised in 95 of 100 runs: before boards, over a field, and over a field with boards, at 0.3 px
-of noise. Of other lenses there is no such rule, since a lens of another name may be as near as the data can tell: what
-is chosen instead is printed. Exits with 1 when a figure is missed.
+The lens radial (2, 3) must be recognised in 95 of 100 runs with 0.3 px of noise: with boards, with a field, and with
+both. There is no such rule for other lenses, since the data may not distinguish a lens from one with another name; the
+lenses chosen instead are printed. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ SCENES: Mapping[str, Callable[[Camera, int], Scene]] = {"boards": _boards, "fiel
 
 
 def choices(scene: str, name: str, runs: int) -> Counter[str]:
-    """How often which lens is chosen where it is the one of that name."""
+    """Counts of the chosen lenses where the true lens has this name."""
     phi, lens = LENSES[name]
     chosen: Counter[str] = Counter()
     for seed in range(runs):
@@ -67,7 +67,7 @@ def choices(scene: str, name: str, runs: int) -> Counter[str]:
 
 
 def rows(scene: str, runs: int) -> Iterator[Row]:
-    """How often each lens is recognised, and what is chosen."""
+    """Share of runs in which each lens is recognised, and the most frequent choices."""
     for name in LENSES:
         chosen = choices(scene, name, runs)
         note = ", ".join(f"{label} {count}" for label, count in chosen.most_common(3))

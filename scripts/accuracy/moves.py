@@ -1,8 +1,8 @@
-"""What a refit after a move is worth: python scripts/run.py moves [--help]
+"""Accuracy of a refit after a move: python scripts/run.py moves [--help]
 
-A camera over half a league's field is calibrated once with boards, then moved many times by 0.1 to 30 degrees and 1 mm
-to 1 m, one time in ten turned by half a turn besides. "yes": the figure keeps to what is asked of it; "no": missed.
-Exits with 1 when a figure is missed.
+A camera above half of a league's field is calibrated once with boards, then moved many times by 0.1 to 30 degrees and
+1 mm to 1 m; every tenth move adds a rotation by 180 degrees. "yes": the limit is kept. "no": it is missed. Exits with 1
+when a figure is missed.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ MOST_SIGMA = 5.0
 
 @lru_cache(maxsize=8)
 def calibrated(seed: int, disturbance: Disturbance = NOISE, boards: int = 12) -> Calibration:
-    """The camera at home: the field and boards, as before any move."""
+    """The camera at its first pose, calibrated with the field and boards."""
     stations = {"overhead": Station("overhead", HOME)}
     scene = field_scene(FIELD, {"overhead": CAMERA}, stations, spacing_m=0.15)
     shown = board_scene(checkerboard(9, 6, 0.1), {"overhead": CAMERA}, stations, boards, seed=1)
@@ -70,14 +70,14 @@ def calibrated(seed: int, disturbance: Disturbance = NOISE, boards: int = 12) ->
 def seen(
     pose: Pose, disturbance: Disturbance, seed: int, spacing_m: float = 0.3, camera: Camera = CAMERA
 ) -> Simulation:
-    """The field from a pose."""
+    """The field seen from a pose."""
     stations = {"overhead": Station("overhead", pose)}
     return simulate(field_scene(FIELD, {"overhead": camera}, stations, spacing_m=spacing_m), disturbance, seed)
 
 
 def random_move(seed: int, home: Pose = HOME, camera: Camera = CAMERA) -> Pose:
-    """Between 0.1 and 30 degrees about any axis, 1 mm to 1 m any way, both even in the logarithm; one in ten is
-    turned by half a turn besides. The camera still sees a seventh of the field, or there is nothing to refit from.
+    """A move by 0.1 to 30 degrees about any axis and 1 mm to 1 m in any direction, both uniform in the logarithm; one
+    in ten adds a rotation by 180 degrees. The camera still sees a seventh of the field, which a refit needs.
     """
     rng = np.random.default_rng([seed, 7])
     while True:
@@ -100,13 +100,13 @@ def _looks_at_field(camera: Camera) -> bool:
 
 
 def truth_of(calibration: Calibration, pose: Pose, camera: Camera = CAMERA) -> Estimate:
-    """The truth in the terms of a calibration."""
+    """The truth as an estimate with the calibration's targets."""
     structure = make_structure(calibration.targets, {})
     return Estimate({"overhead": camera}, {"overhead": Station("overhead", pose)}, {}, structure)
 
 
 def sigmas_off(calibration: Calibration, truth: Estimate) -> Array:
-    """Every number's error in its own stated sigmas."""
+    """Error of every number in its own stated sigmas."""
     posterior = calibration.posterior
     assert posterior is not None
     return np.abs(difference(truth, calibration.estimate, posterior.keys)) / posterior.sd
@@ -116,7 +116,7 @@ def sigmas_off(calibration: Calibration, truth: Estimate) -> Array:
 
 
 def moves_case(runs: int) -> Iterator[Row]:
-    """Whether moves are picked up, or refused in words: never lost without one."""
+    """Whether moves are found, or refused with a message."""
     fresh = [calibrated(seed) for seed in range(8)]
     good, reported, silent, times, worst = 0, [], [], [], 0.0
     for seed in range(runs):
@@ -143,14 +143,14 @@ def moves_case(runs: int) -> Iterator[Row]:
     yield Row("moves", "time of a refit, ms (median)", 1e3 * float(np.median(times)))
 
 
-# ---- of one picture, with no option ----------------------------------------------------------------------------------
+# ---- from one picture, without options ------------------------------------------------------------------------------
 
-STEEPNESS = {"weak": (0.0, 4.0), "tilted": (8.0, 20.0)}  # degrees from straight down: phi hardly known, and known
+STEEPNESS = {"weak": (0.0, 4.0), "tilted": (8.0, 20.0)}  # tilt in degrees: phi is hardly known, and is known
 
 
 def of_one_picture(how: str, seed: int) -> tuple[Calibration, dict[float, tuple[Array, Array, Array]]]:
     """A refit of a camera that was calibrated from one picture by its lines and corners alone; and, for each height,
-    its errors (N,) mm over the field, what is stated of each, and 95 % radii.
+    its errors (N,) mm over the field, the stated standard deviations, and the 95 % radii.
     """
     rng = np.random.default_rng([seed, 11])
     lens = (CAMERA.lens, Brown((-0.2, 0.06, 3e-4, -2e-4, 0.0)))[seed % 2]
@@ -175,7 +175,7 @@ def of_one_picture(how: str, seed: int) -> tuple[Calibration, dict[float, tuple[
 
 
 def _of_one_picture(how: str, runs: int) -> Iterator[Row]:
-    """Whether what a refit states holds at each height."""
+    """Whether the uncertainty that a refit states is correct at each height."""
     count = min(runs, 200)
     every = [errors for _, errors in over(partial(of_one_picture, how), range(count))]
     for height_m in HEIGHTS_M:
@@ -190,12 +190,12 @@ def _of_one_picture(how: str, runs: int) -> Iterator[Row]:
 
 
 def weak_case(runs: int) -> Iterator[Row]:
-    """Where what was known before bends: phi is hardly known."""
+    """Phi is hardly known, so that the earlier knowledge is not described by a covariance alone."""
     return _of_one_picture("weak", runs)
 
 
 def tilted_case(runs: int) -> Iterator[Row]:
-    """Where it does not."""
+    """Phi is known."""
     return _of_one_picture("tilted", runs)
 
 
@@ -206,7 +206,7 @@ CORNERS = ("TopLeftCorner", "BottomLeftCorner", "TopHalfwayCrossing", "BottomHal
 
 
 def thinned(observations: Observations, points: Sequence[str], curves: int, seed: int) -> Observations:
-    """The points of these names, and so many of the curve observations."""
+    """The points with these names, and so many of the curve observations."""
     target = observations.targets["field"]
     wanted = [target.point_names.index(name) for name in points]
     p = np.flatnonzero(np.isin(observations.points.feature, wanted))
@@ -219,7 +219,7 @@ def thinned(observations: Observations, points: Sequence[str], curves: int, seed
 
 
 def bound_of(calibration: Calibration, clean: Observations, pose: Pose) -> tuple[tuple[Key, ...], Array]:
-    """Keys and covariance that data and prior together allow, at the truth."""
+    """Keys and covariance at the truth, from the data and the prior together."""
     truth = truth_of(calibration, pose)
     plan = make_plan(calibration, clean, "pose")
     problem, known = refit_problem(plan, "pose", truth)
@@ -229,7 +229,7 @@ def bound_of(calibration: Calibration, clean: Observations, pose: Pose) -> tuple
 
 
 def bound_case(runs: int) -> Iterator[Row]:
-    """Refits from 30 line points and 4 corners, beside the bound and beside calibrations from scratch."""
+    """Refits from 30 line points and 4 corners, compared with the bound and with calibrations of the new data alone."""
     count = min(runs, 200)
     places = field_places(half=True)
     squared: dict[float, list[tuple[float, float]]] = {height_m: [] for height_m in HEIGHTS_M}
@@ -265,25 +265,25 @@ def bound_case(runs: int) -> Iterator[Row]:
 
 
 def _from_scratch(observations: Observations, seed: int) -> Calibration | None:
-    """From 200 line points (or as many as there are), nothing known of phi or height."""
+    """A calibration from 200 line points (or as many as there are), without a prior for phi or height."""
     try:
         return calibrate(thinned(observations, (), 200, seed), Options(lens="radial"))
     except CalibrationError:
         return None
 
 
-# ---- does it still hold, by photographs? (by observations: checks.py) --------------------------------------------
+# ---- checks by photographs (by observations: checks.py) -------------------------------------------------------------
 
 ALARMS = 0.01
 SMALL_TILT = Pose.looking(HOME.position, rotation_exp((np.deg2rad(0.05), 0.0, 0.0)) @ HOME.rotation)
 SMALL_SHIFT = Pose.looking(HOME.position + np.array([0.003, 0.0, 0.0]), HOME.rotation)
 
 BOARD = checkerboard(9, 6, 0.1)
-FIELD_SHOTS, BOARD_SHOTS, CHECKS = 2, 6, 10  # photographs that a calibration is made from, and checked with
+FIELD_SHOTS, BOARD_SHOTS, CHECKS = 2, 6, 10  # photographs of a calibration, and photographs to check it
 
 
 def photographs_case(runs: int) -> Iterator[Row]:
-    """The same from photographs: calibrations made of some, checked with others of other light, noise and robots."""
+    """Calibrations from photographs, checked by others with different light, noise and robots."""
     count = int(np.clip(runs // CHECKS, 1, 10))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -339,7 +339,7 @@ def _photographed_alarms(
     return alarms / (len(known) * each), float(np.median(noise))
 
 
-# ---- the same question twice, and how long it takes -----------------------------------------------------------------
+# ---- repeated refits, and their time --------------------------------------------------------------------------------
 
 PHASES = """
 import sys, time
@@ -361,7 +361,7 @@ print(*(b - a for a, b in zip(marks, marks[1:])))
 
 
 def time_case(runs: int) -> Iterator[Row]:
-    """`ceres-cal refit` from a cold process to the written file, and its parts."""
+    """Time of `ceres-cal refit` as a whole process, and its parts."""
     count = int(np.clip(runs, 2, 9))
     with tempfile.TemporaryDirectory() as folder:
         old, new, out = (str(Path(folder) / name) for name in ("old.json", "new.json", "out.json"))

@@ -1,10 +1,10 @@
-"""Calibrations of too little, too flat or too lopsided observations: python scripts/run.py odd_scenes [--help]
+"""Calibrations of few, flat or one-sided observations: python scripts/run.py odd_scenes [--help]
 
-Random scenes that somebody does give to a calibration: four to ten points, parallel lines, a field from straight above,
-one board or two, an arc and a line, a few points beside many line points; every lens, noise as stated. A refusal is a
-right answer; counted are calibrations of which a number that is called "known" is over 5 standard deviations off, and
-those that locate a place farther off than 2.5 times its stated 95 % radius. Exits with 1 where there are more of them
-than asked.
+Random scenes as users have them: four to ten points, parallel lines, a field seen from straight above, one board or
+two, an arc and a line, a few points beside many line points; with every lens, and with the stated noise. A refusal is
+correct. Counted are calibrations in which a number called "known" has an error above 5 standard deviations, and those
+that locate a place with an error above 2.5 times its stated 95 % radius. Exits with 1 where there are more than
+allowed.
 """
 
 from __future__ import annotations
@@ -56,15 +56,15 @@ LENSES: dict[str, Callable[[np.random.Generator], tuple[float, Lens]]] = {
         KannalaBrandt((rng.uniform(-0.03, 0.02), rng.uniform(-0.005, 0.005), -0.002, 0.0004)),
     ),
 }
-"""phi and lens of cameras that see a field; the script's image is of 1280 x 960 px."""
+"""phi and lens of cameras that see a field; the image has 1280 x 960 px."""
 
 
 # ---- scenes ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """A camera drawn at random, and what draws the rest."""
+class RandomCamera:
+    """A random camera, and the random generator for the rest of its scene."""
 
     rng: np.random.Generator
     camera: Camera
@@ -72,7 +72,7 @@ class Drawn:
     def over_the_field(
         self, tilt_deg: tuple[float, float], points: tuple[int, int], curves: Sequence[str], spacing_m: float
     ) -> Scene:
-        """What one station over the field shows of some of the points that it sees, and of curves; see `seen_from`."""
+        """The scene of one station above the field with some of the visible points, and curves; see `seen_from`."""
         rng = self.rng
         tilt, direction = rng.uniform(*tilt_deg), rng.uniform(0.0, 2.0 * np.pi)
         height_m = rng.uniform(4.0, 7.0) * (0.65 if self.camera.lens.kind == "kannala-brandt" else 1.0)
@@ -82,7 +82,7 @@ class Drawn:
         return self.seen_from(pose, points, curves, spacing_m)
 
     def seen_from(self, pose: Pose, points: tuple[int, int], curves: Sequence[str], spacing_m: float) -> Scene:
-        """What is seen from a pose of so many points (from, to), at random, and of curves of these names."""
+        """The scene from a pose with a random number of points (from, to), and with the curves of these names."""
         shown = well_inside(self.camera.at(pose), FIELD.point_array)
         seen = [name for name, inside in zip(FIELD.point_names, shown, strict=True) if inside]
         stations = {"a": Station("a", pose)}
@@ -94,33 +94,33 @@ class Drawn:
         return [str(name) for name in self.rng.permutation(names)[: self.rng.integers(least, most + 1)]]
 
 
-def _few_points(drawn: Drawn) -> Scene:
+def _few_points(drawn: RandomCamera) -> Scene:
     return drawn.over_the_field((0.0, 30.0), (4, 10), (), 1.0)
 
 
-def _few_line_points(drawn: Drawn) -> Scene:
+def _few_line_points(drawn: RandomCamera) -> Scene:
     return drawn.over_the_field((0.0, 30.0), (0, 0), drawn.some(_STRAIGHT, 5, 9), drawn.rng.uniform(0.3, 2.0))
 
 
-def _points_and_few_line_points(drawn: Drawn) -> Scene:
+def _points_and_few_line_points(drawn: RandomCamera) -> Scene:
     return drawn.over_the_field((0.0, 30.0), (4, 8), drawn.some(_STRAIGHT, 1, 4), drawn.rng.uniform(0.3, 2.0))
 
 
-def _parallel(drawn: Drawn) -> Scene:
+def _parallel(drawn: RandomCamera) -> Scene:
     lines = _ALONG if drawn.rng.random() < 0.5 else _ACROSS
     return drawn.over_the_field((0.0, 30.0), (0, 6), lines, drawn.rng.uniform(0.1, 0.5))
 
 
-def _frontal(drawn: Drawn) -> Scene:
+def _frontal(drawn: RandomCamera) -> Scene:
     return drawn.over_the_field((0.0, 2.0), (0, 12), FIELD.curve_names, drawn.rng.uniform(0.1, 0.5))
 
 
-def _one_curve(drawn: Drawn) -> Scene:
+def _one_curve(drawn: RandomCamera) -> Scene:
     curves = ["CenterCircle", *drawn.some(_STRAIGHT, 1, 2)]
     return drawn.over_the_field((0.0, 30.0), (2, 6), curves, drawn.rng.uniform(0.05, 0.3))
 
 
-def _boards(drawn: Drawn, most: int) -> Scene:
+def _boards(drawn: RandomCamera, most: int) -> Scene:
     rng = drawn.rng
     board = checkerboard(int(rng.integers(5, 10)), int(rng.integers(4, 7)), 0.1)
     low = rng.uniform(0.0, 40.0)
@@ -130,11 +130,11 @@ def _boards(drawn: Drawn, most: int) -> Scene:
     return board_scene(board, {"a": drawn.camera}, stations, most, int(rng.integers(1 << 30)), held)
 
 
-def _points_beside_lines(drawn: Drawn) -> Scene:
+def _points_beside_lines(drawn: RandomCamera) -> Scene:
     return drawn.over_the_field((5.0, 25.0), (5, 8), _STRAIGHT, 0.25)
 
 
-_Maker = Callable[[Drawn], Scene]
+_Maker = Callable[[RandomCamera], Scene]
 ODD: dict[str, _Maker] = {
     "few points": _few_points,
     "few line points": _few_line_points,
@@ -147,7 +147,7 @@ ODD: dict[str, _Maker] = {
 }
 
 
-def _above(drawn: Drawn) -> Scene:
+def _above(drawn: RandomCamera) -> Scene:
     return drawn.over_the_field((0.0, 12.0), (6, 30), FIELD.curve_names, drawn.rng.uniform(0.2, 1.0))
 
 
@@ -156,32 +156,33 @@ BY_DEFAULT: dict[str, _Maker] = {"above a field": _above, "three boards": partia
 
 
 def odd_problem(make: _Maker, lens: str, seed: int, *, is_named: bool = True) -> Problem:
-    """The same maker, lens and seed give the same problem; each prior's value is the true one. A lens that is not named
-    is chosen by default.
+    """The same maker, lens and seed give the same problem; the value of each prior is the true one. Unless the lens is
+    named, the default options choose it.
     """
     rng = np.random.default_rng([seed, 13])
     phi, model = LENSES[lens](rng)
     free_centre = bool(rng.random() < 0.7)
     centre = (639.5 + rng.uniform(-15.0, 15.0), 479.5 + rng.uniform(-15.0, 15.0)) if free_centre else (639.5, 479.5)
     options = Options(lens=lens, free_principal_point=free_centre) if is_named else Options()
-    scene = make(Drawn(rng, Camera((1280, 960), phi, centre, model)))
+    scene = make(RandomCamera(rng, Camera((1280, 960), phi, centre, model)))
     priors: tuple[Prior, ...] = ()
     if len(scene.placements) == 0 and rng.random() < 0.25:
         priors = (taped(scene, "a", 0.01),)
     return Problem(scene, options, priors)
 
 
-# ---- what came out --------------------------------------------------------------------------------------------------
+# ---- results --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One scene's calibration.
+    """The result for one scene.
 
     Attributes:
-        refused: the message where there was none. sigmas: how many standard deviations the farthest "known" number is
-            off, and which. radii: how many stated 95 % radii the farthest located place is off. level: of the verdict,
-            where one of them is too far. accused: what was stated, and is right, and is said to be contradicted.
+        refused: the message of a refusal, "" otherwise. sigmas, which: the largest error of a "known" number in
+            standard deviations, and the quantity. radii: the largest error of a located place in stated 95 % radii.
+            level: of the verdict, where one of these is too large. accused: correct statements that are reported as
+            contradicted.
     """
 
     kind: str
@@ -202,12 +203,12 @@ class Outcome:
 
     @property
     def wrong(self) -> bool:
-        """Whether a "known" number is too far off."""
+        """Whether the error of a "known" number is too large."""
         return self.sigmas > MOST_SIGMAS
 
     @property
     def misplaced(self) -> bool:
-        """Whether a place is."""
+        """Whether the error of a place is too large."""
         return self.radii > MOST_RADII
 
 
@@ -223,7 +224,7 @@ def outcome(kind: str, make: _Maker, lens: str, seed: int) -> Outcome:
 
 
 def observed(problem: Problem, noises_px: Sequence[float], seed: int) -> Observations:
-    """What is observed of a problem, with one of these noises, and each prior as far off as it says."""
+    """Observations of a problem with one of these noises; each prior's value has an error with its stated sigma."""
     rng = np.random.default_rng([seed, 14])
     priors = [replace(p, value=tuple(rng.normal(p.value, p.sigma).tolist())) for p in problem.priors]
     sigma_px = float(rng.choice(noises_px))
@@ -232,7 +233,7 @@ def observed(problem: Problem, noises_px: Sequence[float], seed: int) -> Observa
 
 
 def judged(of: Outcome, calibration: Calibration, observations: Observations, scene: Scene) -> Outcome:
-    """The outcome, with how far off what came out is."""
+    """The outcome with the errors of the calibration."""
     sigmas, which, radii = farthest(calibration, scene)
     accused = ", ".join(f"{one.owner} {one.quantity}" for one in calibration.conflicts)
     found = replace(of, sigmas=sigmas, which=which, radii=radii, accused=accused)
@@ -242,8 +243,8 @@ def judged(of: Outcome, calibration: Calibration, observations: Observations, sc
 
 
 def farthest(calibration: Calibration, scene: Scene) -> tuple[float, str, float]:
-    """How many standard deviations the farthest "known" number is off, and which; how many stated 95 % radii the
-    farthest located place is off.
+    """Largest error of a "known" number in standard deviations, and its quantity; largest error of a located place in
+    stated 95 % radii.
     """
     stations = {name: Station(place.camera, place.cam_from_world) for name, place in scene.stations.items()}
     truth = Estimate(scene.cameras, stations, scene.placements, calibration.estimate.structure)
@@ -266,10 +267,10 @@ def _farthest_known(calibration: Calibration, truth: Estimate) -> tuple[float, s
 
 
 def _is_within(truth: Estimate, calibration: Calibration, camera: str) -> bool:
-    """Whether the lens that was solved for can be the true one.
+    """Whether the solved lens model contains the true lens.
 
-    Otherwise its principal point is the middle of another distortion and its coefficients are other numbers: the scene
-    has no true value of them. What such a lens shows has one, and is judged always, by places on the floor and above.
+    If it does not, its principal point and its coefficients have no true value in the scene. The places on the floor
+    and above it that such a lens locates do have true values, and are always judged.
     """
     lens, solved = truth.cameras[camera].lens, calibration.cameras[camera].lens
     if lens.kind != solved.kind or lens.names != solved.names:
@@ -294,14 +295,14 @@ def _farthest_place(calibration: Calibration, truth: Estimate) -> float:
 
 
 def _one(kinds: Mapping[str, _Maker], seed: int) -> Outcome:
-    """Kinds and lenses in turns."""
+    """One scene; the seed goes through all kinds and lenses."""
     every = [(kind, lens) for lens in LENSES for kind in kinds]
     kind, lens = every[seed % len(every)]
     return outcome(kind, kinds[kind], lens, seed)
 
 
 def summary(title: str, found: Sequence[Outcome], worst: int) -> None:
-    """Print what came out, by kind and lens, and the worst."""
+    """Print counts by kind and lens, and the worst scenes."""
     print(f"{title}: {len(found)} scenes, {sum(bool(o.refused) for o in found)} refused")
     print(f"  {'':30}{'scenes':>8}{'refused':>9}{'known > 5 sd':>14}{'places > 2.5':>14}")
     for kind, lens in Counter((o.kind, o.lens) for o in found):

@@ -1,4 +1,4 @@
-"""A camera whose pictures OpenCV's functions make: what the package's lenses and simulations get wrong alike shows."""
+"""A camera that projects with OpenCV's functions, to find errors that the package's lenses and simulations share."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ceres_cal.scene.lens import Brown
 from ceres_cal.simulate import Scene
 
 _PLACES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
-"""Of the coefficients in the vector of `cv2.projectPoints`."""
+"""Names of the coefficients in the vector of `cv2.projectPoints`, in order."""
 _PRECISE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
 _STEPS = np.append(np.linspace(0.0, 0.97, 32), [1.0 - 1e-6, 1.0])[:, None, None]
-"""From the axis to a ray, on which a lens must not fold; the last one tells whether it does just there."""
+"""Fractions of a ray's distance from the axis, at which the lens must not fold; the last ones test the ray itself."""
 
 
 @dataclass(frozen=True)
-class Tilted(Brown):
-    """Coefficients of Brown's lens before a sensor that is turned by tau_x and tau_y, rad, which only OpenCV has."""
+class TiltedSensor(Brown):
+    """Coefficients of Brown's lens for a sensor that is tilted by tau_x and tau_y, rad, which only OpenCV models."""
 
     values: tuple[float, ...] = (0.0,) * 7
     kind: ClassVar[str] = "tilted sensor"
@@ -34,8 +34,8 @@ class Tilted(Brown):
         return ("k1", "k2", "p1", "p2", "k3", "tau_x", "tau_y")
 
 
-class SeenByOpenCv(Camera, eq=True):
-    """A camera that maps places to pixels, and pixels to rays, by OpenCV. Its lens only holds the coefficients."""
+class OpenCvCamera(Camera, eq=True):
+    """A camera that maps places to pixels, and pixels to rays, with OpenCV; its lens only stores the coefficients."""
 
     @property
     def _by_angle(self) -> bool:
@@ -57,19 +57,19 @@ class SeenByOpenCv(Camera, eq=True):
         return np.array(found, dtype=float).reshape(-1, 2)
 
     def project(self, points_world: ArrayLike) -> Array:
-        """Points (N, 3) m -> pixels (N, 2); NaN behind the camera and past where the lens folds."""
+        """Points (N, 3) m -> pixels (N, 2); NaN behind the camera and beyond a fold of the lens."""
         places = np.array(points_world, dtype=float).reshape(-1, 3)
         rotation, shift = self.cam_from_world.rotation, self.cam_from_world.translation
         rays = places @ rotation.T + shift
         shown = np.flatnonzero(rays[:, 2] > 0.0)
         shown = shown[self._unfolded(rays[shown])]
         pixels = np.full((len(places), 2), np.nan)
-        if len(shown):  # OpenCV asks for one at least
+        if len(shown):  # OpenCV needs at least one
             pixels[shown] = self._pixels(places[shown], np.array(cv2.Rodrigues(rotation)[0], dtype=float), shift)
         return pixels
 
     def _unfolded(self, rays: Array) -> Mask:
-        """(N,) whether the way from the axis to a ray leads outwards in the picture, too."""
+        """(N,) whether the image radius increases all the way from the axis to a ray."""
         if not len(rays):
             return np.zeros(0, dtype=bool)
         depths = np.broadcast_to(rays[:, 2:], (len(_STEPS), len(rays), 1))
@@ -89,5 +89,5 @@ class SeenByOpenCv(Camera, eq=True):
 
 
 def in_opencv(scene: Scene) -> Scene:
-    """A scene whose cameras OpenCV's functions show."""
-    return replace(scene, cameras={name: SeenByOpenCv(**vars(camera)) for name, camera in scene.cameras.items()})
+    """The scene with cameras that project with OpenCV."""
+    return replace(scene, cameras={name: OpenCvCamera(**vars(camera)) for name, camera in scene.cameras.items()})

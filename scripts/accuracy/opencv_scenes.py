@@ -1,13 +1,13 @@
-"""Calibrations, checks and refits of what OpenCV's functions show: python scripts/run.py opencv_scenes [--help]
+"""Calibrations, checks and refits of images that OpenCV's functions project: python scripts/run.py opencv_scenes
 
 `cv2.projectPoints` and `cv2.fisheye.projectPoints` show random cameras above a division B field: pictures of three
-sizes, Brown's lens or a fisheye, tilted by up to 40 degrees. What the package's lenses and its simulations get wrong
-alike shows here. Everything is calibrated by default. Of a few clicks there are 4 to 14 points, to 0.3, 1 or 2 px, in
-half of the scenes with some places on lines; else all points and lines are seen, to 0.3 px. Counted are scenes in which
-a number that is called "known" is over 5 standard deviations off, or a place over 2.5 times its stated 95 % radius, and
-those of them whose verdict trusts the calibration; and scenes whose stated heights, all of them right, are said to be
-contradicted. `check` asks a camera that nobody touched, `refit` one that was
-moved, or zoomed by 2 to 5 %, by 4 to 10 clicks. Exits with 1 where there are more than asked.
+sizes, Brown's lens or a fisheye, tilted by up to 40 degrees. This finds errors that the package's lenses and its
+simulations share. Everything is calibrated with default options. Few clicks are 4 to 14 points with noise of 0.3, 1 or
+2 px, in half of the scenes with some places on lines; the other scenes show all points and lines with 0.3 px. Counted
+are scenes in which a number called "known" has an error above 5 standard deviations, or a place an error above 2.5
+times its stated 95 % radius, those of them that the verdict trusts, and scenes whose stated heights, which are correct,
+are reported as contradicted. `check` is run for an unmoved camera, `refit` for one that was moved, or zoomed by 2 to
+5 %, with 4 to 10 clicks. Exits with 1 where there are more than allowed.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from scenery import BoardRanges, board_scene, join, overhead_pose
 
 from accuracy.league import NOISE_PX, TAPE_M, SetUp, scene_of
 from accuracy.moves import ALARMS, random_move
-from accuracy.odd_scenes import Drawn, Outcome, judged, observed
-from accuracy.opencv_camera import SeenByOpenCv, Tilted, in_opencv
+from accuracy.odd_scenes import Outcome, RandomCamera, judged, observed
+from accuracy.opencv_camera import OpenCvCamera, TiltedSensor, in_opencv
 from accuracy.scenes import FIELD, Problem, taped
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
@@ -41,10 +41,10 @@ from ceres_cal.simulate import Scene
 
 SIZES = ((780, 580), (1280, 1024), (1920, 1080))
 CLICKS_PX, SEEN_PX = (0.3, 1.0, 2.0), (0.3,)
-STRETCHED, ZOOMED = (0.01, 0.03), (0.02, 0.05)  # of itself, either way
+STRETCHED, ZOOMED = (0.01, 0.03), (0.02, 0.05)  # relative, with either sign
 _CLICKS, _NEW_CLICKS, _ALL = (4, 14), (4, 10), (len(FIELD.points), len(FIELD.points))
-MOST_MISPLACED = 0.02  # of the cameras; by few clicks 3 of 400 have one
-MOST_ACCUSED = 0.005  # of the scenes
+MOST_MISPLACED = 0.02  # share of the cameras; 3 of 400 have one with few clicks
+MOST_ACCUSED = 0.005  # share of the scenes
 _DEFAULTS = Options()
 _Rng = np.random.Generator
 
@@ -53,7 +53,7 @@ _Rng = np.random.Generator
 
 
 def _brown(rng: _Rng, unit_px: float) -> tuple[float, Lens]:
-    """A barrel that folds in no corner of the picture, as it would from 0.14 on."""
+    """A barrel distortion that does not fold in the corners of the picture, as it would from 0.14 on."""
     phi = unit_px * rng.uniform(0.7, 1.3)
     k1 = -rng.uniform(0.0, 0.1) * (phi / unit_px) ** 2
     return phi, Brown((k1, rng.uniform(0.1, 0.3) * k1**2, *rng.normal(0.0, 5e-4, 2), 0.0))
@@ -68,31 +68,31 @@ def _usual(rng: _Rng, unit_px: float) -> tuple[float, Lens]:
 
 
 def _wide(rng: _Rng, unit_px: float) -> tuple[float, Lens]:
-    """65 to 80 degrees from the axis in the picture's corners."""
+    """A fisheye whose picture reaches 65 to 80 degrees from the axis in its corners."""
     angle = np.deg2rad(rng.uniform(65.0, 80.0))
     k = rng.normal((-0.02, 0.0, 0.0, 0.0), (0.015, 0.004, 0.001, 0.0002))
     return unit_px / (angle * (1.0 + float(k @ angle ** np.array([2, 4, 6, 8])))), KannalaBrandt(tuple(k.tolist()))
 
 
 def _tilted(rng: _Rng, unit_px: float) -> tuple[float, Lens]:
-    """A sensor that is turned by up to 1.2 degrees about each of its edges."""
+    """A sensor that is tilted by up to 1.2 degrees about each of its edges."""
     phi, lens = _brown(rng, unit_px)
-    return phi, Tilted((*lens.values, *rng.uniform(-0.02, 0.02, 2)))
+    return phi, TiltedSensor((*lens.values, *rng.uniform(-0.02, 0.02, 2)))
 
 
 _Lens = Callable[[_Rng, float], tuple[float, Lens]]
-"""phi and a lens for half a diagonal of so many pixels."""
+"""phi and a lens for a picture whose half diagonal has so many pixels."""
 
 
-def _drawn(rng: _Rng, lens: _Lens) -> Drawn:
+def _drawn(rng: _Rng, lens: _Lens) -> RandomCamera:
     width, height = SIZES[rng.integers(len(SIZES))]
     phi, model = lens(rng, 0.5 * float(np.hypot(width, height)))
     centre = rng.normal((0.5 * (width - 1), 0.5 * (height - 1)), (0.01 * width, 0.01 * height))
-    return Drawn(rng, SeenByOpenCv((width, height), phi, (float(centre[0]), float(centre[1])), model))
+    return RandomCamera(rng, OpenCvCamera((width, height), phi, (float(centre[0]), float(centre[1])), model))
 
 
 def _over_the_field(rng: _Rng, height_m: tuple[float, float] = (3.0, 5.0)) -> Pose:
-    """Looks at a place near the field's middle, at up to 40 degrees."""
+    """A pose that looks at a place near the field's middle, tilted by up to 40 degrees."""
     tilt, way = rng.uniform(0.0, 40.0), rng.uniform(0.0, 2.0 * np.pi)
     tilts = tilt * np.cos(way), tilt * np.sin(way)
     turned = overhead_pose(0.0, 0.0, 1.0, *tilts, yaw_deg=rng.uniform(-180.0, 180.0)).rotation
@@ -101,7 +101,7 @@ def _over_the_field(rng: _Rng, height_m: tuple[float, float] = (3.0, 5.0)) -> Po
 
 
 def _stretched(rng: _Rng, scene: Scene) -> Scene:
-    """With fy / fx of each camera 1 to 3 % off 1."""
+    """The scene with fy / fx of each camera 1 to 3 % from 1."""
     off = rng.uniform(*STRETCHED, len(scene.cameras)) * rng.choice([-1.0, 1.0], len(scene.cameras))
     cameras = zip(scene.cameras.items(), off.tolist(), strict=True)
     return replace(scene, cameras={name: replace(camera, aspect=1.0 + by) for (name, camera), by in cameras})
@@ -132,7 +132,7 @@ def _seen(
 
 
 def _of_the_league(rng: _Rng, cameras: int, stretched: bool = False) -> Problem:
-    """As the league hangs them (`league.py`), in half of the scenes with their heights."""
+    """Cameras placed as in `league.py`, in half of the scenes with stated heights."""
     tilt_deg, height = float(rng.choice([0.0, 1.0, 3.0, 8.0, 20.0])), bool(rng.random() < 0.5)
     scene = in_opencv(scene_of(SetUp(cameras, tilt_deg, "brown", False, height), rng))
     scene = _stretched(rng, scene) if stretched else scene
@@ -144,9 +144,9 @@ class Kind:
     """Scenes to calibrate.
 
     Attributes:
-        draw: draws one. noises_px: one of them is chosen. numbers: whether numbers are judged beside places: those of a
-            camera without an axis perpendicular to its sensor have no true value in the package's lenses. asked: what
-            docs/limits.md states as a limit is counted only.
+        draw: makes one. noises_px: one of them is chosen. numbers: whether numbers are judged in addition to places;
+            those of a camera with a tilted sensor have no true value in the package's lenses. asked: whether limits
+            apply; kinds that docs/limits.md lists as limits are only counted.
     """
 
     draw: Callable[[_Rng], Problem]
@@ -198,11 +198,11 @@ def _of(name: str, seed: int, scene: Scene) -> Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Changed:
-    """A camera that was calibrated, and what is seen of it later.
+class CameraChange:
+    """A calibrated camera, and its later observations.
 
     Attributes:
-        before, after: the scenes. clicked: whether the later one shows clicks, not lines.
+        before, after: the scenes. clicked: whether the later scene shows clicks instead of lines.
     """
 
     before: Scene
@@ -210,15 +210,15 @@ class Changed:
     clicked: bool
 
     def calibrated(self, seed: int) -> Calibration:
-        """By default, of what was seen before."""
+        """The calibration of the scene before, with default options."""
         return calibrate(observed(Problem(self.before, _DEFAULTS), SEEN_PX, seed))
 
     def seen(self, seed: int) -> Observations:
-        """What is seen later."""
+        """The later observations."""
         return observed(Problem(self.after, _DEFAULTS), CLICKS_PX[:2] if self.clicked else SEEN_PX, seed + 1)
 
 
-def changed(change: str, clicked: bool, seed: int) -> Changed:
+def changed(change: str, clicked: bool, seed: int) -> CameraChange:
     """A camera that sees the field, in half of the scenes with six boards; then "moved", "zoomed" or neither."""
     rng = np.random.default_rng([seed, 16])
     drawn, home = _drawn(rng, _usual), _over_the_field(rng, (4.0, 5.5))
@@ -232,11 +232,11 @@ def changed(change: str, clicked: bool, seed: int) -> Changed:
     elif change == "zoomed":
         camera = replace(camera, phi=camera.phi * (1.0 + rng.uniform(*ZOOMED) * rng.choice([-1.0, 1.0])))
     points, curves = (_NEW_CLICKS, ()) if clicked else ((0, 0), drawn.some(FIELD.curve_names, 2, 4))
-    return Changed(before, Drawn(rng, camera).seen_from(pose, points, curves, 0.15), clicked)
+    return CameraChange(before, RandomCamera(rng, camera).seen_from(pose, points, curves, 0.15), clicked)
 
 
 def checked(clicked: bool, seed: int) -> bool | None:
-    """Whether a camera that nobody touched is said to have changed; None where it is refused."""
+    """Whether a camera that did not change is reported as changed; None where the check is refused."""
     both = changed("", clicked, seed)
     try:
         return not check(both.calibrated(seed), both.seen(seed), ALARMS).holds
@@ -245,7 +245,7 @@ def checked(clicked: bool, seed: int) -> bool | None:
 
 
 def refitted(change: str, what: str, seed: int) -> tuple[Outcome, bool]:
-    """The refit of a camera that was moved or zoomed, and whether it says that the zoom was changed."""
+    """The refit of a camera that was moved or zoomed, and whether it reports another zoom."""
     both = changed(change, True, seed)
     of = _of(f"refit, {change}, {what}", seed, both.after)
     try:
@@ -263,7 +263,7 @@ _KNOWN = "known numbers over 5 sd off"
 
 
 def _told(case: str, every: Sequence[Outcome], cameras: int, asked: bool) -> Iterator[Row]:
-    """Counts of what came out wrong; each that did goes to standard error."""
+    """Counts of wrong results; each of these is also printed to standard error."""
     for one in every:
         if one.wrong or one.misplaced or one.accused:
             print(one, file=sys.stderr, flush=True)

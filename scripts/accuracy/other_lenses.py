@@ -1,10 +1,10 @@
-"""Lenses by their own formulas, which the package need not have: python scripts/run.py other_lenses [--help]
+"""Lenses given by formulas, which the package need not have: python scripts/run.py other_lenses [--help]
 
-Each lens is a formula of this script; 6, 12 and 25 views of a board, tilted by up to 40 degrees, fill its picture, with
-0.2 px of noise. Calibrated by defaults, so that the lens is chosen by the data: how far from where the truth has them
-rays are seen over the part of the image that the views fill, over the standard deviation that is stated (root mean
-square, the rotation that fits best taken out). 1 where the statement is honest; a lens that is chosen too simple would
-show as several. Exits with 1 when a figure is missed by more than two of its standard errors.
+Each lens is a formula of this script. 6, 12 or 25 views of a board, tilted by up to 40 degrees, fill its picture with
+0.2 px of noise, and are calibrated with default options, so that the lens is chosen. Printed is the error of rays over
+the part of the image that the views fill, divided by the stated standard deviation (root mean square, after the
+best-fitting rotation). It is 1 where the statement is honest; a lens model that is too simple would give a larger
+value. Exits with 1 when a figure is missed by more than two standard errors.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def _rational(at: Array) -> Array:
 
 
 def _tilted_sensor(at: Array) -> Array:
-    """A sensor that is turned about the axis's foot by 1.1 and 0.7 degrees, whose rows and columns stay perpendicular:
-    OpenCV's tauX and tauY.
+    """A sensor that is tilted about its principal point by 1.1 and 0.7 degrees; its rows and columns stay
+    perpendicular. These are OpenCV's tauX and tauY.
     """
     turn = rotation_exp(np.array([0.02, 0.012, 0.0]))
     seen = np.column_stack([_brown((-0.2, 0.05, 0.0), (0.0, 0.0), at), np.ones(len(at))]) @ turn
@@ -94,14 +94,14 @@ LENSES: Mapping[str, tuple[Project, float]] = {
     "division": (partial(_by_angle, _division), 48.0),
     "wavy": (partial(_by_angle, _wavy), 36.0),
 }
-"""Name -> projection, and the largest angle from the axis, deg, that is photographed."""
+"""Name -> projection, and the largest angle from the axis, deg, in the picture."""
 
 
 # ---- scenes ---------------------------------------------------------------------------------------------------------
 
 
 def observed(lens: Project, reach_deg: float, views: int, seed: int) -> Observations:
-    """The corners of a board in so many views, as a lens shows them."""
+    """The corners of a board in so many views through a lens."""
     rng = np.random.default_rng(seed)
     pixels, features = zip(*(_view(lens, np.deg2rad(reach_deg), rng) for _ in range(views)), strict=True)
     return board_views(_BOARD, _SIZE, pixels, features)
@@ -110,7 +110,7 @@ def observed(lens: Project, reach_deg: float, views: int, seed: int) -> Observat
 def board_views(
     board: Target, size: tuple[int, int], pixels: Sequence[Array], features: Sequence[Array]
 ) -> Observations:
-    """Observations of a board by one camera: in each view pixels, and the corners that they show."""
+    """Observations of a board by one camera: the pixels of each view, and the corners that they show."""
     numbers = np.repeat(np.arange(len(pixels), dtype=np.int32), [len(each) for each in features])
     names = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(len(pixels)))
     points = Points(numbers, np.concatenate(features), np.concatenate(pixels), np.ones(len(numbers)))
@@ -118,7 +118,7 @@ def board_views(
 
 
 def _view(lens: Project, reach: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Pixels and numbers of the corners of one view that lie in the picture, of views that show enough of them."""
+    """Pixels and numbers of the visible corners of a random view that shows enough of them."""
     while True:
         axis = rng.standard_normal(3)
         turn = rotation_exp(axis / np.linalg.norm(axis) * np.deg2rad(rng.uniform(5.0, 40.0)))
@@ -134,7 +134,7 @@ def _view(lens: Project, reach: float, rng: np.random.Generator) -> tuple[Array,
 
 
 def off_over_stated(calibration: Calibration, lens: Project, observations: Observations) -> float:
-    """Mean square over the image of how far rays are seen from where the lens has them, over what is stated."""
+    """Mean square of the errors of rays over the image, each divided by its stated standard deviation."""
     camera = calibration.estimate.cameras["camera"].at(Pose.identity())
     pixels = seen_grid(observations)
     rays = camera.rays(pixels)

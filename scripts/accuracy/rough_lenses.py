@@ -1,11 +1,12 @@
-"""Wide lenses that are rougher than any formula, before many boards: python scripts/run.py rough_lenses [--help]
+"""Wide lenses that are rougher than any formula, with many boards: python scripts/run.py rough_lenses [--help]
 
-A stereographic lens to 84 degrees over 6016 x 4016 px, with a wave along the radius, decentring, and waves across of
-random directions, of so many px and so long (one over their wave number, px); 186 views of a board of 10 x 10 corners
-that is bowed by 1 mm, 0.4 px of noise, 0.12 px that go together over a board, 2 % of outliers; by defaults. How far
-residuals exceed those that the true lens leaves is in the first row, then errors of rays over the standard deviation
-that is stated (as in other_lenses.py), then the difference of random halves of the views over what both state (as in
-halves.py). Exits with 1 when a figure is missed by more than two of its standard errors.
+The lens is stereographic to 84 degrees over 6016 x 4016 px. Added are a wave along the radius, decentring, and waves of
+random directions with a given size, px, and length (one over the wave number, px). There are 186 views of a board of
+10 x 10 corners that is bowed by 1 mm, with 0.4 px of independent noise, 0.12 px of noise that is correlated over a
+board, and 2 % outliers. Everything is calibrated with default options. The first row is the estimated noise over the
+true one, the second the error of rays over the stated standard deviation (as in other_lenses.py), the others the
+difference between random halves of the views over what both state (as in halves.py). Exits with 1 when a figure is
+missed by more than two standard errors.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from ceres_cal.scene.targets import checkerboard
 _SIZE, _CENTRE, _PHI, _REACH_DEG = (6016, 4016), np.array([3021.3, 1997.8]), 1900.0, 86.0
 _BOARD = checkerboard(10, 10, 0.0588)
 _VIEWS, _NOISE_PX, _TOGETHER_PX, _OUTLIERS, _LEAST_CORNERS, _MARGIN_PX = 186, 0.4, 0.12, 0.02, 25, 4.0
-_WAVES = 400  # that make a random displacement
+_WAVES = 400  # whose sum is a random displacement
 
 
 @dataclass(frozen=True)
-class Rough:
-    """A lens: the size of its wave along the radius, px, how often that goes up and down to the corner, the size of its
-    waves across, px, and one over their wave number, px.
+class RoughLens:
+    """A lens: amplitude of its wave along the radius, px, and number of periods to the corner; amplitude of its random
+    waves, px, and their length (one over the wave number, px).
     """
 
     along_px: float
@@ -62,11 +63,11 @@ class Rough:
 
 
 LENSES = {
-    "smooth": Rough(0.0, 0.0, 0.0, 1000.0),
-    "long waves": Rough(2.0, 1.5, 0.4, 1500.0),
-    "waves": Rough(3.0, 2.5, 0.4, 800.0),
-    "short waves": Rough(3.0, 4.0, 0.3, 450.0),
-    "waves along the radius": Rough(1.5, 7.0, 0.0, 1000.0),
+    "smooth": RoughLens(0.0, 0.0, 0.0, 1000.0),
+    "long waves": RoughLens(2.0, 1.5, 0.4, 1500.0),
+    "waves": RoughLens(3.0, 2.5, 0.4, 800.0),
+    "short waves": RoughLens(3.0, 4.0, 0.3, 450.0),
+    "waves along the radius": RoughLens(1.5, 7.0, 0.0, 1000.0),
 }
 
 
@@ -76,7 +77,7 @@ def _bowed() -> Array:
     return np.asarray(places + np.outer(1e-3 * (1.0 - x * x) - 0.5e-3 * (1.0 - y * y), (0.0, 0.0, 1.0)))
 
 
-def observed(lens: Rough, seed: int) -> Observations:
+def observed(lens: RoughLens, seed: int) -> Observations:
     """The corners of the board in all views."""
     rng, places = np.random.default_rng(seed), _bowed()
     apart = places[:, None, :2] - places[None, :, :2]
@@ -87,8 +88,8 @@ def observed(lens: Rough, seed: int) -> Observations:
     return board_views(_BOARD, _SIZE, pixels, features)
 
 
-def _view(lens: Rough, seed: int, board: Array, agree: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Pixels and numbers of the corners of one view that lie in the picture, of views that show enough of them."""
+def _view(lens: RoughLens, seed: int, board: Array, agree: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Pixels and numbers of the visible corners of a random view that shows enough of them."""
     while True:
         axis = rng.standard_normal(3)
         turn = rotation_exp(axis / np.linalg.norm(axis) * np.deg2rad(rng.uniform(5.0, 45.0)))
@@ -126,7 +127,7 @@ def rows(name: str, runs: int) -> Iterator[Row]:
     yield Row(name, "noise found over true", *mean_and_error(np.array(scales) / noise), 0.95, 1.05, note)
     yield Row(name, "error over stated, rms", *root_and_error(off), 0.5, 1.25, note)
     for what in ("intrinsics", "projections"):
-        squares = [value for one in apart if np.isfinite(value := getattr(one, what))]  # other lenses, other numbers
+        squares = [value for one in apart if np.isfinite(value := getattr(one, what))]  # halves with other lenses: none
         if squares:
             yield Row(name, f"halves, {what} over stated", *root_and_error(squares), 0.4, 1.25, note)
 

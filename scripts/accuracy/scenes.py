@@ -1,4 +1,4 @@
-"""The scenes that `accuracy.py` measures on: problems with their priors, ssl-vision's table, fields painted amiss."""
+"""The scenes of `accuracy.py`: problems with their priors, those measured with ssl-vision, and misplaced paint."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SPACING_M = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A scene, how it is solved, and what is known beforehand: each prior's value is the true one."""
+    """A scene, the options of its calibration, and priors whose values are the true ones."""
 
     scene: Scene
     options: Options
@@ -43,7 +43,7 @@ def _camera() -> Camera:
 
 
 def taped(scene: Scene, station: str, sigma_m: float) -> Prior:
-    """The height of a station, measured to so much."""
+    """A prior for the height of a station with this sigma."""
     height_m = float(scene.camera_at(station).position[2])
     return Prior("station", station, "height_m", (height_m,), (sigma_m,))
 
@@ -52,7 +52,7 @@ def taped(scene: Scene, station: str, sigma_m: float) -> Prior:
 
 
 def boards(phi: float, lens: Lens, count: int = 20) -> Problem:
-    """A board at some places before one camera."""
+    """A board at some places in front of one camera."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=BoardRanges((0.5, 1.5)))
@@ -60,14 +60,14 @@ def boards(phi: float, lens: Lens, count: int = 20) -> Problem:
 
 
 def over_the_field() -> Problem:
-    """One camera over a division B field: its points, lines and circle; the height is known to 10 mm."""
+    """One camera above a division B field, with its points, lines and circle; the height is known to 10 mm."""
     pose = overhead_pose(-0.3, 0.2, 5.2, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=1.6)
     scene = field_scene(FIELD, {"overhead": _camera()}, {"overhead": Station("overhead", pose)}, spacing_m=_SPACING_M)
     return Problem(scene, Options(usual_camera=False, lens="radial"), (taped(scene, "overhead", 0.010),))
 
 
 def two_cameras() -> Problem:
-    """Two cameras over one field, which both see the middle of, and six boards that both see at once."""
+    """Two cameras above one field that both see its middle, and six boards that both see at the same time."""
     right = Camera((1280, 960), 873.4, (631.2, 486.0), Radial((-6.1e-5, 6.3e-7)))
     cameras = {"left": _camera(), "right": right}
     stations = {
@@ -88,11 +88,11 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
 }
 
 
-# ---- how well it is known -------------------------------------------------------------------------------------------
+# ---- problems with phi and height correlated ------------------------------------------------------------------------
 
 
 def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0, spacing_m: float = 0.4) -> Problem:
-    """A few lines' worth of a whole field seen by a tilted camera, with what may be known or shown besides."""
+    """A whole field's lines, sparsely observed by a tilted camera, with a stated height or boards if wanted."""
     cameras = {"overhead": replace(_camera(), phi=560.0)}
     pose = overhead_pose(-0.3, 0.2, 4.0, tilt_x_deg=0.6 * tilt_deg, tilt_y_deg=-0.8 * tilt_deg, yaw_deg=1.6)
     stations = {"overhead": Station("overhead", pose)}
@@ -108,20 +108,20 @@ def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0
 
 
 def small_boards(count: int, seed: int) -> Scene:
-    """Boards so small and far away that perspective hardly tells their two poses apart."""
+    """Boards so small and distant that perspective hardly distinguishes their two mirrored poses."""
     cameras = {"camera": Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))}
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(6, 5, 0.06)
     return board_scene(board, cameras, stations, count, seed, held=BoardRanges((0.7, 2.5), (15.0, 40.0)))
 
 
-# ---- ssl-vision's table ---------------------------------------------------------------------------------------------
+# ---- scenes of ssl-vision -------------------------------------------------------------------------------------------
 
 _HALF_DIAGONAL_2004_PX = 0.5 * hypot(780, 580)
 _PAPER_LIKE = Radial((-0.9e-3, 4.0e-6), (2, 3))
 """The paper's polynomial with a1 = 1, in the pixels of a 780 x 580 image: 450 px -> 632 px."""
 _SSL_VISION = Radial((2.0e-6,), (3,))
-"""ssl-vision's own model, as strong: 450 px -> 632 px."""
+"""ssl-vision's own model with the same strength: 450 px -> 632 px."""
 
 SSL_VISION_MM: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "half, paper's lens": ((2.5, 8.2), (3.0, 8.4)),
@@ -129,15 +129,16 @@ SSL_VISION_MM: Mapping[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "half, its own lens": ((0.82, 2.1), (1.9, 3.8)),
     "whole, its own lens": ((0.56, 1.5), (0.58, 1.7)),
 }
-"""Measured of ssl-vision's own calibrator, not here: mean and worst field error at z = 0 and at z = 150 mm, medians
-over 20 seeds. It was given each point's right line and the height."""
+"""Errors of ssl-vision's own calibrator, which was measured elsewhere: mean and worst field error at z = 0 and at
+z = 150 mm, medians over 20 seeds. It was given the correct line of each point, and the height."""
 
 
 def ssl_problem(half: bool, lens: Radial) -> Problem:
-    """Camera at 4 m, tilted by 3 degrees, four corners and line points every 150 mm; the height is known to 5 mm.
+    """A camera at 4 m, tilted by 3 degrees, sees four corners and line points every 150 mm; the height is known to 5
+    mm.
 
-    Half the field in 780 x 580 px, where barrel distortion cuts off what bulges out of the image, or the whole field in
-    1280 x 960 px with the lens scaled along.
+    It sees half of the field in 780 x 580 px, where the barrel distortion cuts off a part, or the whole field in 1280 x
+    960 px with the lens scaled to this size.
     """
     size = (780, 580) if half else (1280, 960)
     grown = 0.5 * hypot(*size) / _HALF_DIAGONAL_2004_PX
@@ -168,7 +169,7 @@ SSL_PROBLEMS: dict[str, Callable[[], Problem]] = {
 
 
 def field_places(half: bool = False) -> Array:
-    """A grid of places (N, 2) m every 250 mm over the field or its left half."""
+    """A grid of places (N, 2) m every 250 mm on the field or its left half."""
     x, y = np.meshgrid(np.linspace(-4.5, 0.0 if half else 4.5, 19 if half else 37), np.linspace(-3.0, 3.0, 25))
     return np.column_stack([x.ravel(), y.ravel()])
 
@@ -177,11 +178,11 @@ def field_places(half: bool = False) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Painted:
-    """What cameras see of a field painted amiss, under the names of the field as drawn.
+class PaintedField:
+    """Observations of a field whose paint is misplaced, with the names of the field as drawn.
 
     Attributes:
-        offsets_m: by how much each line and the numbers of the circle are off, named as tolerances name them.
+        offsets_m: offsets of each line and of the numbers of the circle, named as in tolerances.
     """
 
     scene: Scene
@@ -190,7 +191,7 @@ class Painted:
 
 
 def _paint(seed: int) -> tuple[dict[str, Curve], dict[str, float]]:
-    """The curves of the field, each off by PAINT_SIGMA_M, and by how much."""
+    """The curves of the field with random offsets of PAINT_SIGMA_M, and these offsets."""
     rng = np.random.default_rng(seed)
     curves: dict[str, Curve] = {}
     offsets: dict[str, float] = {}
@@ -209,14 +210,14 @@ def _paint(seed: int) -> tuple[dict[str, Curve], dict[str, float]]:
     return curves, offsets
 
 
-def _observed(scene: Scene, offsets_m: Mapping[str, float], seed: int, priors: tuple[Prior, ...] = ()) -> Painted:
-    assert scene.targets["field"].curve_names == FIELD.curve_names  # so that features keep their numbers
+def _observed(scene: Scene, offsets_m: Mapping[str, float], seed: int, priors: tuple[Prior, ...] = ()) -> PaintedField:
+    assert scene.targets["field"].curve_names == FIELD.curve_names  # features keep their numbers
     seen = simulate(scene, CLEAN_NOISE, seed).observations
-    return Painted(scene, replace(seen, targets={**seen.targets, "field": FIELD}, priors=priors), offsets_m)
+    return PaintedField(scene, replace(seen, targets={**seen.targets, "field": FIELD}, priors=priors), offsets_m)
 
 
-def painted_by_six_stations(seed: int) -> Painted:
-    """One camera at six stations over a field painted amiss, four frames each, and ten boards before the first."""
+def painted_by_six_stations(seed: int) -> PaintedField:
+    """One camera at six stations above a misplaced field, four frames each, and ten boards at the first station."""
     places = [
         (-2.2, -1.2, 4.6, 12.0, 6.0, 10.0),
         (2.1, -1.0, 5.0, 14.0, -8.0, 95.0),
@@ -233,10 +234,10 @@ def painted_by_six_stations(seed: int) -> Painted:
     return _observed(join(field, boards), offsets_m, seed)
 
 
-def painted_by_two_cameras(seed: int, heights_known: bool) -> Painted:
-    """Two static cameras, each over its half of a field painted amiss; nothing but the field is seen.
+def painted_by_two_cameras(seed: int, heights_known: bool) -> PaintedField:
+    """Two static cameras, each above its half of a misplaced field; nothing but the field is seen.
 
-    Known heights are known to 5 mm; else phi and height trade off.
+    Known heights are known to 5 mm; otherwise phi and height are correlated.
     """
     stations = {
         "left": Station("left", overhead_pose(-2.2, 0.0, 4.0, 2.0, 1.0, 0.0)),
@@ -250,7 +251,7 @@ def painted_by_two_cameras(seed: int, heights_known: bool) -> Painted:
 
 
 def without_noise(simulation: Simulation) -> Observations:
-    """What was simulated, at its true pixels."""
+    """The simulated observations at their true pixels."""
     found = simulation.observations
     points = replace(found.points, pixels=simulation.points.pixels)
     return replace(found, points=points, curves=replace(found.curves, pixels=simulation.curves.pixels))

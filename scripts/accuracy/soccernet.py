@@ -1,11 +1,11 @@
 """SoccerNet's calibration benchmark on a folder in its format: python scripts/run.py soccernet FOLDER [--help]
 
 FOLDER holds frames.json, {frame: {line: [[x, y], ...]}} in fractions of a picture of 960 x 540 px, and pitch.json, the
-pitch as a target and the name of each line in it. Calibrated are the annotated points, not the pictures. Of an answer
-every line of the pitch is drawn: one is right when all points annotated on it lie nearer to it than 5 (10, 20) px, and
-the Jaccard index is the share of right ones among the lines that are annotated or drawn, of the better of the labels
-as given and turned by half a turn. The final score is completeness times the index at 5 px. Exits with 1 where a figure
-is missed.
+pitch as a target and the name of each line in it. The annotated points are calibrated, not the pictures. Every line of
+the pitch is drawn with the calibration. A line is right when all points annotated on it lie nearer to it than 5 (10,
+20) px. The Jaccard index is the share of right lines among those that are annotated or drawn, with the labels as given
+or rotated by 180 degrees, whichever is better. The final score is completeness times the index at 5 px. Exits with 1
+where a figure is missed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _Lines = Mapping[str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Pitch:
-    """A folder's pitch, and the name in it of each line that is annotated."""
+    """A folder's pitch, and the name in it of each annotated line."""
 
     target: Target
     names: Mapping[str, str]
@@ -67,7 +67,7 @@ class Pitch:
         return {name: curve_points(self.target.curves[own], 0, _PIECES) for name, own in self.names.items()}
 
     def turned(self) -> dict[str, str]:
-        """The line that each one lies on where the pitch is turned by half a turn."""
+        """The line that each line coincides with after a rotation of the pitch by 180 degrees."""
         places = self.places()
         middle = {name: where.mean(axis=0) for name, where in places.items()}
         turned = {name: where * (-1.0, -1.0, 1.0) for name, where in middle.items()}
@@ -78,7 +78,7 @@ class Pitch:
 
 
 def drawn(camera: Camera, places: Mapping[str, Array]) -> dict[str, Array]:
-    """(N, 2) px of each line that is seen inside the picture, and one place beyond where it leaves it."""
+    """(N, 2) px of each line inside the picture, with one place beyond each end."""
     lines = {}
     for name, where in places.items():
         pixels = camera.project(where)
@@ -111,7 +111,7 @@ def _distance(point: Array, polyline: Array) -> float:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a frame was answered with: the index at LIMITS_PX, or the message of a refusal."""
+    """The result for a frame: the index at LIMITS_PX, or the message of a refusal."""
 
     frame: str
     jaccard: tuple[float, ...] = ()

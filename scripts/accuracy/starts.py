@@ -1,13 +1,13 @@
-"""What a start is found for: python scripts/run.py starts [--help]
+"""Scenes for which an initial estimate must be found: python scripts/run.py starts [--help]
 
-"middle" and "quarter": cameras of a division A field as halls have them, the middle one over a touch line, the halfway
-line and the circle (and the centre line), a quarter's over lines of its corner, 30 points on each, with and without a
-height. "drawn": 2 to 8 features of a field before a camera whose phi is known or not. Counted are refusals of scenes
-that a rank by finite differences of the exact scene calls solvable, and calibrations of which a number that is called
-"known" is over 5 standard deviations off. "labels": two points or two curves of one of ten fields under each other's
-names. "advice": four points and 24 line points, and then whatever `advise` proposes besides, three poles among it.
-"clicks": four corners of each photograph of ../shared clicked 8 px off, and six of a football pitch seen from its
-stands. Exits with 1 where there are any.
+"middle" and "quarter": cameras of a division A field as in halls, with and without a stated height. The middle one sees
+a touch line, the halfway line and the circle (and the centre line), the other one lines of a quarter's corner, with 30
+points on each. "drawn": 2 to 8 features of a field, and a camera whose phi is known or not. Counted are refusals of
+scenes that are solvable (by the rank of finite differences of the exact scene), and calibrations in which a number
+called "known" has an error above 5 standard deviations. "labels": two points or two curves of one of ten fields with
+exchanged names. "advice": four points and 24 line points, and then each measurement that `advise` proposes, including
+three poles. "clicks": four corners of each photograph of ../shared, clicked with errors of 8 px, and six of a football
+pitch seen from its stands. Exits with 1 where there are any.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from itertools import combinations
 
 import numpy as np
 from photos.real_data import real_place
-from photos.shared import CLICK_PX, Known, known_photographs, spread
+from photos.shared import CLICK_PX, KnownPhotograph, known_photographs, spread
 from runner import Row, over, script
 from scenery import field_scene, overhead_pose
 
@@ -45,7 +45,7 @@ _FIELD = ssl_field("A")
 _SIZE = (1280, 1024)
 _MOST_ON_A_CURVE = 30
 _NOISE_PX = 0.3
-_SOLVABLE = 1e-5  # least over largest singular value, each number in its own unit: the scenes drawn leave a gap there
+_SOLVABLE = 1e-5  # least over largest singular value, each number in its own unit; no random scene is near it
 _STEP = 1e-6
 _MIDDLE = ("TopTouchLine", "HalfwayLine", "CenterCircle", "CenterLine")
 _QUARTER = ("TopTouchLine", "LeftGoalLine", "LeftPenaltyStretch", "LeftFieldRightPenaltyStretch", "HalfwayLine")
@@ -54,8 +54,8 @@ _HELD = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scene: the message of a refusal, or by how many standard deviations what is known is off, and
-    which of phi and height are called known.
+    """The result for one scene: the message of a refusal, or the largest error of a known number in standard
+    deviations, and which of phi and height are called known.
     """
 
     refused: str = ""
@@ -88,7 +88,7 @@ def labels(runs: int) -> Iterator[Row]:
 
 
 def _exchanged(seed: int) -> bool:
-    """Whether two exchanged points or curves of a field are found to be, and nothing else is."""
+    """Whether two exchanged points or curves of a field are found, and nothing else is renamed."""
     rng = np.random.default_rng([seed, 24])
     fields = targets_by_name()
     field = fields[list(fields)[seed % len(fields)]]
@@ -122,7 +122,7 @@ def advice(runs: int) -> Iterator[Row]:
 
 
 def _advised(seed: int) -> list[tuple[str, str]]:
-    """What is proposed for four points and 24 line points, and why that is refused, "" where it is not."""
+    """Measurements proposed for four points and 24 line points, and why each is refused, "" where it is not."""
     rng = np.random.default_rng([seed, 25])
     camera = Camera(_SIZE, rng.uniform(700.0, 900.0), (639.5, 511.5), Radial((-5e-5, 6e-7)))
     tilts = rng.uniform(-12.0, 12.0, 2)
@@ -163,19 +163,19 @@ def clicks(runs: int) -> Iterator[Row]:
 
 
 @cache
-def _photographs() -> list[Known]:
+def _photographs() -> list[KnownPhotograph]:
     shared = real_place().parent
     every = [one for name in ("photos", "photos3") for one in known_photographs(shared / name)]
     return [one for one in every if not one.is_wrong]
 
 
-def _corners(shown: Known) -> Mapping[str, Sequence[float]]:
+def _corners(shown: KnownPhotograph) -> Mapping[str, Sequence[float]]:
     target, corners = targets_by_name()[shown.truth["asked_as"]], shown.truth.get("corners_px", {})
     return {name: pixel for name, pixel in corners.items() if name in target.point_index}
 
 
-def _clicked(shown: Known, seed: int) -> str:
-    """Why four right clicks on a photograph are refused, "" where they are not."""
+def _clicked(shown: KnownPhotograph, seed: int) -> str:
+    """Why four correct clicks on a photograph are refused, "" where they are not."""
     corners, target = _corners(shown), targets_by_name()[shown.truth["asked_as"]]
     four = {name: corners[name] for name in max(combinations(corners, 4), key=lambda four: spread(corners, four))}
     why = _refusal(np.random.default_rng([seed, 26]), four, target, tuple(shown.truth["image_size"]))
@@ -183,7 +183,7 @@ def _clicked(shown: Known, seed: int) -> str:
 
 
 def _pitch(seed: int) -> str:
-    """The same of six right clicks on a football pitch."""
+    """Why six correct clicks on a football pitch are refused, "" where they are not."""
     rng, pitch = np.random.default_rng([seed, 27]), targets_by_name()["football"]
     camera = Camera((1920, 1080), rng.uniform(1200.0, 2500.0), (959.5, 539.5), Brown((0.0,) * 5))
     stands, to = np.array([rng.uniform(-20.0, 20.0), -60.0, 15.0]), np.array([rng.uniform(-30.0, 30.0), -10.0, 0.0])
@@ -236,7 +236,7 @@ def _quarter(seed: int) -> Outcome:
 def _hall(
     rng: np.random.Generator, curves: tuple[str, ...], position: tuple[float, float, float], *, stated: bool
 ) -> Outcome:
-    """A camera over a hall's field, with an exact height or none."""
+    """A camera above a field in a hall, with or without a stated height."""
     tilts = rng.uniform(-6.0, 6.0, 2)
     camera = Camera(_SIZE, rng.uniform(700.0, 900.0), (639.5, 511.5), Radial((rng.uniform(-6e-5, 0.0), 5e-7)))
     pose = overhead_pose(*position, tilts[0], tilts[1], yaw_deg=rng.uniform(-180.0, 180.0))
@@ -247,7 +247,7 @@ def _hall(
 
 
 def _drawn(seed: int) -> Outcome | None:
-    """None where the scene is not solvable."""
+    """The outcome of a random scene; None where the scene is not solvable."""
     rng = np.random.default_rng([seed, 23])
     phi_known = bool(rng.random() < 0.5)
     camera = Camera(_SIZE, rng.uniform(500.0, 1400.0), (639.5, 511.5), Brown((0.0,) * 5))
@@ -259,7 +259,7 @@ def _drawn(seed: int) -> Outcome | None:
     scene = field_scene(_FIELD, {"c": camera}, {"c": Station("c", pose)}, spacing_m=0.02)
     try:
         every = _thinned(simulate(scene, Disturbance(), 1).observations)
-    except CalibrationError:  # quiet: the camera looks past the field
+    except CalibrationError:  # the camera does not see the field
         return None
     seen = [(0, f) for f in np.unique(every.points.feature)] + [(1, f) for f in np.unique(every.curves.feature)]
     if len(seen) < 2:
@@ -284,7 +284,7 @@ def _outcome(scene: Scene, observations: Observations, options: Options) -> Outc
 
 
 def _thinned(observations: Observations) -> Observations:
-    """So many on each curve, evenly."""
+    """The observations with at most so many on each curve, evenly spaced."""
     kept = np.zeros(len(observations.curves), dtype=bool)
     for feature in np.unique(observations.curves.feature):
         own = np.flatnonzero(observations.curves.feature == feature)
@@ -303,7 +303,7 @@ def _of_features(observations: Observations, chosen: set[tuple[int, int]]) -> Ob
 
 
 def _is_solvable(exact: Observations, camera: Camera, pose: Pose, *, phi_known: bool) -> bool:
-    """Whether what is seen changes, to first order, with every pose and phi: by differences of `Camera.project`."""
+    """Whether the observations determine the pose, and phi, to first order: by differences of `Camera.project`."""
     field = next(iter(exact.targets.values()))
     curves = list(field.curves.values())
     places, beside = [field.point_array[exact.points.feature], np.empty((0, 3))], [np.empty((0, 3))]

@@ -1,7 +1,7 @@
-"""What every command takes on the sample, as a process from its start to its exit: python scripts/run.py command_speed
+"""Time of every command on the sample, as a whole process: python scripts/run.py command_speed [--help]
 
-Processor time of all threads, imports included, the median of --runs; the time on a clock is less where two cores help,
-and more where others use them. Printed as the table of docs/speed.md. Exits with 1 where a command fails.
+Processor time of all threads, imports included, median of --runs. Elapsed time is shorter where two cores are used, and
+longer where other processes use them. Printed as the table of docs/speed.md. Exits with 1 where a command fails.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COMMANDS = (
 
 
 def processor_s(command: str, folder: Path) -> float:
-    """Seconds of processor that one run takes."""
+    """Processor time of one run, s."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     line = f"source .venv/bin/activate; ceres-cal {command}"
     done = subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True, check=False)

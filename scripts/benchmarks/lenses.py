@@ -1,4 +1,4 @@
-"""What a lens and the choice of one take: processor seconds on the wide lens. Run benchmark.py --lenses."""
+"""Time of a lens and of the automatic choice: processor seconds for the wide lens. Run benchmark.py --lenses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BROWN, _SPLINE, _AUTO = Options(lens="brown"), Options(lens="spline"), Options(
 
 
 def lens_rows(sizes: Sequence[int], repeat: int, warm_up_s: float) -> list[dict[str, Any]]:
-    """Of each number of frames, in turns: brown, spline, auto, and by its name the lens that auto chooses."""
+    """For each number of frames, in turns: brown, spline, auto, and, by its name, the lens that auto chooses."""
     return [_row(frames, repeat, warm_up_s) for frames in sizes]
 
 
@@ -36,7 +36,7 @@ def _row(frames: int, repeat: int, warm_up_s: float) -> dict[str, Any]:
 
 
 def _seconds(observations: Observations, options: Options) -> float:
-    fresh = replace(observations)  # forgets what was derived from it
-    start = time.process_time()  # which others at work hardly change
+    fresh = replace(observations)  # without cached results
+    start = time.process_time()  # other processes hardly change it
     calibrate(fresh, options)
     return time.process_time() - start

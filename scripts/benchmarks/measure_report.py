@@ -1,4 +1,4 @@
-"""How large the report of 100 000 observations is, and how long `calibrate --report` takes as a whole process.
+"""Size of the report for 100 000 observations, and time of `calibrate --report` as a whole process.
 
 Run: python scripts/run.py measure_report [--help]. Exits with 1 when a figure is missed.
 """
@@ -27,14 +27,14 @@ _NOISE = Disturbance(0.5, 0.3, outliers=0.05, wrong_labels=0.01)
 
 
 def of_a_field() -> Observations:
-    """Lines and arcs of one leaning camera."""
+    """Lines and arcs of a field, seen by one tilted camera."""
     stations = {"overhead": Station("overhead", overhead_pose(-0.5, -1.2, 5.2, tilt_x_deg=-14.0, tilt_y_deg=-11.5))}
     scene = field_scene(ssl_field("B"), {"overhead": _CAMERA}, stations, frames=90, spacing_m=0.04)
     return simulate(scene, _NOISE, 1).observations
 
 
 def of_boards() -> Observations:
-    """A thousand boards of a hundred corners."""
+    """A thousand boards with a hundred corners each."""
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(checkerboard(10, 10, 0.05), {"camera": _CAMERA}, stations, count=1000, seed=3)
     return simulate(scene, _NOISE, 1).observations
@@ -44,7 +44,7 @@ SETS: dict[str, Callable[[], Observations]] = {"field": of_a_field, "boards": of
 
 
 def measured(observations: Observations, runs: int) -> tuple[float, float]:
-    """MB of the page, and the shortest of some runs in seconds."""
+    """MB of the page, and the shortest time of some runs in seconds."""
     with tempfile.TemporaryDirectory() as folder:
         source, page = Path(folder) / "observations.npz", Path(folder) / "page.html"
         observations.save(source)
@@ -59,7 +59,7 @@ def measured(observations: Observations, runs: int) -> tuple[float, float]:
 
 
 def rows(name: str, runs: int) -> Iterator[Row]:
-    """Of one set of observations."""
+    """The figures for one set of observations."""
     observations = SETS[name]()
     size_mb, seconds = measured(observations, runs)
     count = len(observations.points) + len(observations.curves)

@@ -1,8 +1,8 @@
 """The other solvers of the benchmark, each on the same corners: OpenCV, pycolmap and mrcal.
 
-Needs NumPy and the library of the peer that is asked for, nothing of this package: so mrcal runs under the system's
-Python, and each peer in a process of its own. python scripts/benchmarks/peers.py NAME CORNERS.npz WARM_UP_SECONDS
-prints its answer.
+Needs only NumPy and the library of the peer, nothing of this package. Therefore mrcal can run in the system's Python,
+and each peer in a process of its own. `python scripts/benchmarks/peers.py NAME CORNERS.npz WARM_UP_SECONDS` prints the
+answer of a peer.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Corners:
     """Corners of a checkerboard, seen in many frames by one camera, in the order of the frames.
 
     Attributes:
-        image_size: (2,) width, height. grid: (2,) columns, rows of corners, a distance of square_m () apart.
+        image_size: (2,) width, height. grid: (2,) columns, rows of corners. square_m: () distance between them.
         view, feature: (N,) number of the frame, and r * columns + c of the corner. pixels: (N, 2).
     """
 
@@ -71,11 +71,11 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a solver found.
+    """Result of a solver.
 
     Attributes:
-        seconds: of the solve. initialise_seconds: of the start, where that is known to be a part of them.
-        intrinsics: (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 in OpenCV's terms. cam_from_board: (F, 3, 4) as [R t].
+        seconds: of the solve. initialise_seconds: of the initial estimate, where it is known to be a part of them.
+        intrinsics: (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 in OpenCV's notation. cam_from_board: (F, 3, 4) as [R t].
     """
 
     seconds: float
@@ -85,9 +85,9 @@ class Answer:
 
 
 def peak_mib() -> float:
-    """Most memory that this process has held, MiB; NaN where the system does not say (only Linux does, here).
+    """Peak memory of this process, MiB; NaN where the system does not report it (here only Linux does).
 
-    Not `resource.getrusage`: its figure outlives `exec`, so that a child begins with its parent's.
+    `resource.getrusage` is not used: its figure outlives `exec`, so that a child starts with its parent's.
     """
     status = Path("/proc/self/status")
     found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text(encoding="ascii")) if status.exists() else None
@@ -95,14 +95,14 @@ def peak_mib() -> float:
 
 
 def reset_peak() -> None:
-    """Let the peak memory count from here, where the system can (Linux)."""
+    """Restarts the measurement of the peak memory, where the system supports it (Linux)."""
     switch = Path("/proc/self/clear_refs")
     if switch.exists():
         switch.write_text("5", encoding="ascii")
 
 
 def _seed(corners: Corners) -> tuple[Array, Array]:
-    """A start without distortion: camera matrix (3, 3) and cam_from_board (F, 3, 4), by OpenCV."""
+    """Initial estimate without distortion: camera matrix (3, 3) and cam_from_board (F, 3, 4), by OpenCV."""
     import cv2
 
     objects, images = corners.by_frame()
@@ -118,7 +118,7 @@ def _seed(corners: Corners) -> tuple[Array, Array]:
 
 
 def solve_opencv(corners: Corners) -> Answer:
-    """calibrateCamera as it comes; it seeds itself, so its seeding is in its seconds."""
+    """calibrateCamera with its defaults; its time includes its own initial estimate."""
     import cv2
 
     objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
@@ -132,7 +132,7 @@ def solve_opencv(corners: Corners) -> Answer:
 
 
 def _reconstruction(corners: Corners) -> Any:
-    """The corners as a pycolmap reconstruction, at the start; its pixels have (0.5, 0.5) in the middle of the first."""
+    """The corners as a pycolmap reconstruction at the initial estimate; the first pixel's centre is (0.5, 0.5)."""
     import pycolmap
 
     matrix, poses = _seed(corners)
@@ -156,7 +156,7 @@ def _reconstruction(corners: Corners) -> Any:
 
 
 def solve_pycolmap(corners: Corners) -> Answer:
-    """Bundle adjustment, the board held, model OPENCV (no k3, which is 0 in truth); only its `solve` counts."""
+    """Bundle adjustment with a fixed board and model OPENCV (no k3, whose true value is 0); only its `solve` counts."""
     import pycolmap
 
     scene = _reconstruction(corners)
@@ -177,7 +177,7 @@ def solve_pycolmap(corners: Corners) -> Answer:
 
 
 def solve_mrcal(corners: Corners) -> Answer:
-    """mrcal.optimize with LENSMODEL_OPENCV5 from mrcal's own seed; its grid is regular, a corner not seen weighs -1."""
+    """mrcal.optimize with LENSMODEL_OPENCV5 from mrcal's own seed; in its grid, unseen corners have weight -1."""
     import mrcal  # type: ignore[import-not-found, unused-ignore]
 
     columns, rows = corners.grid
@@ -224,9 +224,9 @@ PEERS: dict[str, Callable[[Corners], Answer]] = {
 
 
 def solve_warm(solve: Callable[[Corners], Answer], warm_up_s: float, corners: Corners) -> Answer:
-    """The answer of a solver that has been at work on ten of the frames for so long.
+    """The answer of a solver, after it has solved ten of the frames repeatedly for so long.
 
-    A core that has idled, such as while another's process ran, is slower for a while.
+    A core that was idle, for example while another process ran, is slower for a while.
     """
     few, start = corners.first(WARM_UP_FRAMES), time.perf_counter()
     while time.perf_counter() - start < warm_up_s:

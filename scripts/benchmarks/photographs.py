@@ -1,8 +1,8 @@
 """From photographs to a calibration: whole processes, ours and OpenCV's in turns. Run benchmark.py --photographs.
 
-Ours detects the board and calibrates by defaults, in a Python that calls the package as OpenCV's calls cv2, and as two
-commands with their files. OpenCV's are the usual finder with cornerSubPix, and the newer one, exhaustive and accurate;
-each calls calibrateCamera on the boards that it has found. Fields have no peer: ours alone, a command for each
+Our programs detect the board and calibrate with default options: once in Python, as OpenCV's programs do, and once as
+two commands with files. OpenCV's programs use the usual finder with cornerSubPix, or the newer, exhaustive and accurate
+one, and then call calibrateCamera with the boards that were found. Fields have no peer: our command is run for each
 photograph.
 """
 
@@ -20,7 +20,7 @@ from typing import Any
 from photos.real_data import real_place
 from photos.shared import known_photographs
 
-from benchmarks.process import Spent, command_of, spent
+from benchmarks.process import Cost, command_of, spent
 
 SAMPLE = Path(__file__).parents[2] / "data" / "ssl_field" / "photographs"
 _OURS = """
@@ -60,7 +60,7 @@ print(len(corners), rms)
 
 @dataclass(frozen=True)
 class BoardSet:
-    """Photographs of one board, inner corners along its columns and rows."""
+    """Photographs of one board, and its number of inner corners."""
 
     name: str
     paths: tuple[str, ...]
@@ -69,7 +69,7 @@ class BoardSet:
 
 
 def board_sets() -> Iterator[BoardSet]:
-    """The sample's, and the real ones that are there: see `photos.real_data`."""
+    """The sample's boards, and the real ones that are installed: see `photos.real_data`."""
     real, folders = real_place(), (("boofcv_sony_chess/*.jpg", 4, 6), ("udacity_gopro_wide/GOPR*.jpg", 8, 6))
     patterns = [("the sample", SAMPLE, "board_*.jpg", 9, 6)]
     patterns += [("OpenCV's left camera", real, "opencv_left_right/left*.jpg", 9, 6)]
@@ -81,7 +81,7 @@ def board_sets() -> Iterator[BoardSet]:
 
 
 def photograph_rows(repeat: int) -> list[dict[str, Any]]:
-    """A row for each set: medians, and the median ratio within each turn, by the clock and by processor time."""
+    """A row for each set: medians, and the median ratio within each turn, in elapsed and in processor time."""
     return [_row(one, repeat) for one in board_sets()]
 
 
@@ -93,7 +93,7 @@ def _row(one: BoardSet, repeat: int) -> dict[str, Any]:
         "accurate": [_OPENCV, "accurate", *size, *one.paths],
     }
     row: dict[str, Any] = {"set": one.name}
-    for name, program in programs.items():  # files are read once
+    for name, program in programs.items():  # so that files are cached
         said = subprocess.run([sys.executable, "-c", *program], capture_output=True, text=True, check=True).stdout
         boards, rms_px, *parts = map(float, said.split())
         row[f"{name}_boards"], row[f"{name}_rms_px"] = int(boards), rms_px
@@ -111,8 +111,8 @@ def _row(one: BoardSet, repeat: int) -> dict[str, Any]:
     return row
 
 
-def _commands(one: BoardSet) -> Spent:
-    """`detect board` and `calibrate`, one after the other."""
+def _commands(one: BoardSet) -> Cost:
+    """`detect board` and then `calibrate`."""
     with tempfile.TemporaryDirectory() as folder:
         board, camera = f"{folder}/board.json", f"{folder}/camera.json"
         size = ["--columns", str(one.columns), "--rows", str(one.rows), "--square", "30mm"]
@@ -120,13 +120,14 @@ def _commands(one: BoardSet) -> Spent:
             spent(command_of("detect", "board", *one.paths, *size, "-o", board, "--quiet")),
             spent(command_of("calibrate", board, "-o", camera, "--quiet")),
         ]
-    return Spent(sum(step.wall for step in steps), sum(step.processor for step in steps))
+    return Cost(sum(step.wall for step in steps), sum(step.processor for step in steps))
 
 
 def field_rows() -> list[dict[str, Any]]:
-    """What `detect field --auto` takes for each photograph of a field, and whether it has found the field.
+    """Time of `detect field --auto` for each photograph of a field, and whether it finds the field.
 
-    They are the sample's, and those of another renderer that are there, each asked for as a user would name it.
+    The photographs are the sample's and, if installed, those of another renderer, each with the options a user would
+    give.
     """
     asked = [(path, "ssl-b", "LeftGoalLine=top") for path in sorted(SAMPLE.glob("000*.jpg"))]
     for known in known_photographs(real_place().parent / "photos"):
@@ -141,7 +142,7 @@ def field_rows() -> list[dict[str, Any]]:
 
 
 def field_summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Median and worst processor time, of those found and of those refused."""
+    """Median and longest processor time, of found fields and of refusals."""
     kinds = {"found": True, "refused": False}
     own = {name: [row["processor"] for row in rows if row["found"] is kind] for name, kind in kinds.items()}
     return [

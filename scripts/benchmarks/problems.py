@@ -1,4 +1,4 @@
-"""What the benchmark solves: a board before a wide lens, and a field under a static camera, both from a fixed seed."""
+"""Problems of the benchmark, from a fixed seed: a board in front of a wide lens, and a field below a static camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ceres_cal.simulate import Scene, Station, simulate
 WIDE = Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))
 COLUMNS, ROWS, SQUARE_M = 10, 10, 0.1
 CORNERS_PX = 0.3
-_LEAST_CORNERS = 20  # of a frame
+_LEAST_CORNERS = 20  # in a frame
 
 OVERHEAD = Camera((1280, 960), 600.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
 HEIGHT_M, HEIGHT_SIGMA_M, TILT_DEG = 4.0, 0.005, 3.0
@@ -30,14 +30,14 @@ _LINES_PX, _CROSSINGS_PX = 0.3, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Corners of a board, and its truth: rotations (F, 3, 3) of cam_from_board."""
+    """Corners of a board, and their truth: rotations (F, 3, 3) of cam_from_board."""
 
     corners: Corners
     rotations: Array
 
 
 def wide_lens(frames: int, seed: int = 0) -> Problem:
-    """The wide lens before a board at random poses; corners that fall outside the image are not seen."""
+    """The wide lens in front of a board at random poses; corners outside the image are not seen."""
     rng = np.random.default_rng(seed)
     number = np.arange(COLUMNS * ROWS)
     board = np.column_stack([number % COLUMNS - 4.5, number // COLUMNS - 4.5, 0.0 * number]) * SQUARE_M
@@ -75,9 +75,10 @@ def corner_observations(corners: Corners) -> Observations:
 
 
 def field_observations(line_points: int, seed: int = 0) -> Observations:
-    """A division B field in as many frames of a static overhead camera as it takes, its height known to 5 mm.
+    """A division B field in as many frames of a static overhead camera as needed; its height is known to 5 mm.
 
-    The scene is projected once; frames differ in their noise. The last frame ends where there are line points enough.
+    The scene is projected once, and the frames differ in their noise. The last frame ends when the number of line
+    points is reached.
     """
     clean = simulate(_field()).observations
     frames = -(-line_points // len(clean.curves))

@@ -1,7 +1,7 @@
-"""What a script pays: whole processes, from start to exit, ours and OpenCV's in turns. Run benchmark.py --process.
+"""Cost of a calibration in a script: whole processes, ours and OpenCV's in turns. Run benchmark.py --process.
 
-Ours is `ceres-cal calibrate`, with everything that it says and the calibration written; OpenCV's a Python that reads
-the same corners, calls calibrateCamera and ends. On the sample OpenCV has the boards alone: it takes no lines.
+Ours is `ceres-cal calibrate`, with all its output and the calibration written. OpenCV's is a Python process that reads
+the same corners, calls calibrateCamera and ends. On the sample OpenCV has only the boards, since it takes no lines.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ cv2.calibrateCamera(objects, images, tuple(size.tolist()), None, None)
 
 
 @dataclass(frozen=True)
-class Spent:
-    """Seconds of one process, and of processor time in all its threads; and its exit code."""
+class Cost:
+    """Elapsed seconds of one process, processor seconds of all its threads, and its exit code."""
 
     wall: float
     processor: float
@@ -52,9 +52,9 @@ def command_of(*arguments: str) -> list[str]:
     return [sys.executable, "-c", _OURS, *arguments]
 
 
-def spent(command: Sequence[str], codes: Sequence[int] = (0,)) -> Spent:
-    """Of one run, which must end with one of the codes; Python keeps its compiled modules, as an installed package has
-    them, and others have nothing of what our package sets for its own process.
+def spent(command: Sequence[str], codes: Sequence[int] = (0,)) -> Cost:
+    """Cost of one run, which must end with one of the codes. Python stores its compiled modules, as for an installed
+    package, and the other programs do not inherit the variables that our package sets for its own process.
     """
     variables = {key: value for key, value in os.environ.items() if key not in (_ALWAYS_COMPILED, OURS_ALONE)}
     before, start = os.times(), time.perf_counter()
@@ -63,16 +63,16 @@ def spent(command: Sequence[str], codes: Sequence[int] = (0,)) -> Spent:
         raise subprocess.CalledProcessError(done.returncode, command, stderr=done.stderr)
     wall, after = time.perf_counter() - start, os.times()
     processor = after.children_user - before.children_user + after.children_system - before.children_system
-    return Spent(wall, processor, done.returncode)
+    return Cost(wall, processor, done.returncode)
 
 
 def process_rows(repeat: int) -> list[dict[str, Any]]:
-    """The sample, then the wide lens from each number of frames: medians, and the median ratio within each turn."""
+    """The sample, then the wide lens with each number of frames: medians, and the median ratio within each turn."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name, ours, theirs in [_sample(Path(folder)), *(_wide(Path(folder), frames) for frames in FRAMES)]:
             for command in (ours, theirs):
-                spent(command)  # files are read once
+                spent(command)  # so that files are cached
             turns = [(spent(ours), spent(theirs)) for _ in range(repeat)]
             row: dict[str, Any] = {"problem": name}
             for what in ("wall", "processor"):

@@ -1,4 +1,4 @@
-"""Growth past memory and past one process, for scripts/benchmark.py --scale."""
+"""Growth beyond memory and beyond one process, for scripts/benchmark.py --scale."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from ceres_cal.observations import NO_CURVES, Observations
 from ceres_cal.observations.columns import NO_POINTS, View
 from ceres_cal.observations.files import HEADER, Content, header_of
 
-FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
+FOLDER = "CERES_CAL_BENCHMARK"  # environment variable with the folder of the observations
 _FRAMES = 2000  # written at once
 _WARM_UP = 20_000  # line points at most
-_TIMES = 10  # the fewest frames between two times of more
-_ASKED = 50  # times, for what asking takes
-_BYTES = 40  # of disk for a line point, and what else a frame has
+_TIMES = 10  # repetitions of the smallest size between two runs of a larger one
+_ASKED = 50  # requests, for the time that a request takes
+_BYTES = 40  # of disk for a line point, including its share of a frame
 
 
 @contextmanager
 def folder_for(line_points: int) -> Iterator[Path]:
-    """A folder with room for so many, which is gone at the end, SIGTERM's too."""
+    """A temporary folder with room for so many line points; it is removed at the end, also after SIGTERM."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     free = shutil.disk_usage(tempfile.gettempdir()).free
     if free < _BYTES * line_points:
@@ -48,7 +48,7 @@ def folder_for(line_points: int) -> Iterator[Path]:
 
 
 def write_field(path: Path, line_points: int) -> None:
-    """`field_observations` as a folder of columns, of which never more than a part is in memory."""
+    """`field_observations` as a folder of columns, of which only a part is in memory at any time."""
     one = field_observations(min(line_points, _WARM_UP))
     per_frame = int(np.count_nonzero(one.curves.view == 0))
     frames = -(-line_points // per_frame)
@@ -76,10 +76,10 @@ def write_field(path: Path, line_points: int) -> None:
 
 
 def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
-    """Seconds of a calibration from the folder, peak memory of the process and of a worker, what an iteration takes.
+    """Time of a calibration from the folder, peak memory of the process and of a worker, and the cost of an iteration.
 
     Args:
-        workers: of Dask, in processes of their own with a thread each; 0 for none.
+        workers: number of Dask's worker processes, each with one thread; 0 for none.
     """
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.problem.parameters import Options
@@ -116,7 +116,7 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
 
 
 def _warm_up(line_points: int) -> None:
-    """What a process does once: imports, compiled kernels."""
+    """Work that a process does once: imports, compiled kernels."""
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.problem.parameters import Options
 
@@ -129,7 +129,7 @@ def _processor(client: Any) -> list[float]:
 
 
 def _overhead_s(client: Any, observations: Observations) -> float:
-    """What it takes to ask the workers and hear their answers, without the work: the median."""
+    """Median time of a request to the workers and their answers, without the work itself."""
     from ceres_cal.problem.engines import OnWorkers
     from ceres_cal.problem.shares import cut
 
@@ -147,9 +147,10 @@ def _nothing(_: Any) -> int:
 
 
 def frames_in_turns(sizes: Sequence[int], turns: int) -> list[dict[str, Any]]:
-    """What a frame of a board before a wide lens takes, and how many times what one of the fewest takes, in turns.
+    """Time of a frame (a board in front of a wide lens) for each size, and its ratio to that of the smallest size.
 
-    Each size stands between two times of the fewest: a processor's pace changes by half within a minute.
+    Each run of a size is compared with the runs of the smallest size before and after it, since the speed of a
+    processor may change by half within a minute.
     """
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.problem.parameters import Options
@@ -200,7 +201,7 @@ def _cluster(workers: int) -> Iterator[Any]:
 
 
 def _watched(stack: ExitStack, client: Any) -> list[tuple[float, int]]:
-    """Seconds of each evaluation from now on, and the bytes that go to a worker and back for it, the most of any."""
+    """Seconds of each evaluation from now on, and the largest number of bytes sent to a worker and back for it."""
     from ceres_cal.problem import engines
     from ceres_cal.problem.shares import Share
 

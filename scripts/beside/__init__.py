@@ -1,1 +1,1 @@
-"""Parts of peers.py: each peer as it is called, the questions, and the page that is made of the answers."""
+"""Parts of peers.py: how each peer is called, the questions, and the page with the answers."""

@@ -1,7 +1,7 @@
-"""Two questions of real boards: is the stated uncertainty true, and are new views predicted?
+"""Two questions for real boards: is the stated uncertainty true, and are new views predicted?
 
-Truth: random halves of the views are calibrated by themselves; what the two differ by stands over what both together
-state. Prediction: every other view is held out; of it the poses alone are solved for, by the same code for all.
+Truth: random halves of the views are calibrated separately; their difference is divided by what both state.
+Prediction: every other view is held out, and only its pose is solved for, by the same code for all peers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beside.environments import OURS, ask
 from beside.sets import of_views
 
 WIDE = ("ov plane", "fisheye")
-"""Sets beyond what a pinhole's polynomial is made for."""
+"""Sets that are too wide for a pinhole with a polynomial."""
 STATED: Mapping[str, Sequence[str]] = {
     OURS: ("default",),
     "opencv": ("default",),
@@ -27,7 +27,7 @@ STATED: Mapping[str, Sequence[str]] = {
     "pycolmap": ("OPENCV",),
     "calibsense": ("default", "clustered"),
 }
-"""Settings of those that state an uncertainty."""
+"""Settings of the peers that state an uncertainty."""
 _WIDE_STATED: Mapping[str, Sequence[str]] = {
     OURS: ("default",),
     "mrcal": ("default",),
@@ -42,13 +42,13 @@ PREDICTING: Mapping[str, Sequence[str]] = {
     "calibsense": ("default", "rational", "fisheye"),
     "lensboy": ("default", "FULL_14", "spline 12x9"),
 }
-_OTHERS = 3.0  # times the median of the best, up to which an answer has a say in which corners count
-_FAR = 6.0  # times its own median, from which on a corner is an outlier to an answer
+_OTHERS = 3.0  # times the smallest median; an answer below has a vote on which corners count
+_FAR = 6.0  # times the median of an answer, above which a corner is an outlier for it
 
 
 @dataclass(frozen=True)
 class Task:
-    """One job, of which set, peer and setting."""
+    """One job, with its set, peer and setting."""
 
     name: str
     peer: str
@@ -57,7 +57,7 @@ class Task:
 
 
 def answers(tasks: Sequence[Task], jobs: int) -> list[dict[str, Any]]:
-    """Of each task; the tasks of a peer over a set go into one process, and all of a peer's where jobs is 1."""
+    """Answers to all tasks; the tasks of a peer for one set share a process, or all tasks of a peer where jobs is 1."""
     groups: dict[tuple[str, str], list[int]] = {}
     for number, task in enumerate(tasks):
         groups.setdefault((task.peer, task.name if jobs > 1 else ""), []).append(number)
@@ -74,7 +74,7 @@ def answers(tasks: Sequence[Task], jobs: int) -> list[dict[str, Any]]:
 
 
 def truth_tasks(sets: Mapping[str, Corners], peers: Sequence[str], splits: int, folder: Path) -> Iterator[Task]:
-    """Each set's random halves, for each that states an uncertainty."""
+    """Random halves of each set, for each peer that states an uncertainty."""
     for name, corners in sets.items():
         whole = _saved(folder / f"{name}.npz", corners)
         for split in range(splits):
@@ -91,7 +91,7 @@ def truth_tasks(sets: Mapping[str, Corners], peers: Sequence[str], splits: int, 
 
 
 def truth_rows(tasks: Sequence[Task], found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Of each set, peer and setting: root mean squares over the splits."""
+    """Root mean squares over the splits for each set, peer and setting."""
     rows: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for task, one in zip(tasks, found, strict=True):
         rows.setdefault((task.name, task.peer, task.setting), []).append(one)
@@ -114,7 +114,7 @@ def _truth_row(name: str, peer: str, setting: str, own: Sequence[Mapping[str, An
 
 
 def prediction_tasks(sets: Mapping[str, Corners], peers: Sequence[str], folder: Path) -> Iterator[Task]:
-    """Each set's two halves, views in turn, each predicting the other, by every setting."""
+    """Each set is split into two halves (views in turns), and each half predicts the other, for every setting."""
     for name, corners in sets.items():
         turn = np.arange(corners.frames) % 2 == 0
         paths = [
@@ -127,7 +127,7 @@ def prediction_tasks(sets: Mapping[str, Corners], peers: Sequence[str], folder: 
 
 
 def prediction_rows(tasks: Sequence[Task], found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Of each set, peer and setting: the rms over the corners that count for all, and over what was predicted."""
+    """For each set, peer and setting: rms over the corners that count for all, and its ratio to the predicted rms."""
     rows: list[dict[str, Any]] = []
     for name in dict.fromkeys(task.name for task in tasks):
         own: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
@@ -156,7 +156,7 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> tuple[Array, Array]:
 
 
 def _counted(lengths: Sequence[Array]) -> Any:
-    """(N,) whether a corner counts: that it is no outlier to half of those whose answer is of use."""
+    """(N,) whether a corner counts: it is not an outlier for half of the useful answers or more."""
     medians = [float(np.median(one)) for one in lengths]
     say = [one for one, m in zip(lengths, medians, strict=True) if m < _OTHERS * min(medians)]
     return np.mean([one > _FAR * np.median(one) for one in say], axis=0) < 0.5

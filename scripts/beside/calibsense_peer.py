@@ -1,8 +1,8 @@
-"""calibsense: its refit with covariance, and its audit, as its README's "Python API" calls them.
+"""calibsense: its refit with covariance, and its audit, called as in "Python API" of its README.
 
-The README of its package says: `instrument` re-estimates five coefficients by default; distortion_terms=8 and
-model="fisheye" are its other lenses. It states a covariance, and a second one clustered by view. `run_audit` says what
-it finds (its `trustworthy`, caveats and findings of WARNING and CRITICAL).
+According to its README, `instrument` re-estimates five coefficients by default; distortion_terms=8 and model="fisheye"
+are its other lenses. It states a covariance, and a second one clustered by view. `run_audit` returns its judgement
+(`trustworthy`, caveats, and findings with severity WARNING or CRITICAL).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WARNING = 2  # of its Severity
 
 
 def session_of(corners: Corners, model: str) -> Any:
-    """Its session of these corners."""
+    """calibsense's session for these corners."""
     peer = import_module("calibsense")
     columns, rows = corners.grid.tolist()
     target = peer.Checkerboard(columns=columns, rows=rows, square_size=1e3 * float(corners.square_m))
@@ -36,7 +36,7 @@ def session_of(corners: Corners, model: str) -> Any:
 
 
 def _guess(peer: Any, model: str, corners: Corners) -> Any:
-    """Its prior calibration, which starts its refit: given of a wide lens alone."""
+    """The prior calibration that starts its refit; it is given for a wide lens only."""
     if model != "fisheye" or (focal := wide_focal(corners)) is None:
         return None
     width, height = corners.image_size.tolist()

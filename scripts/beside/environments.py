@@ -1,4 +1,4 @@
-"""An environment for each peer under build/peers, and what is asked of it there."""
+"""An environment for each peer below build/peers, and requests to the peers there."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ class Peer:
     """How a peer is installed.
 
     Attributes:
-        title: its name. module: what is imported of it. packages: what pip installs, in steps; one that begins with
-            --no-deps is installed without what it requires. debian: packages of Debian where pip cannot.
-        least: the oldest Python that its newest wheel is for. note: what is to be known of the install.
+        title: its name. module: the module that is imported. packages: what pip installs, in steps; a step that begins
+            with --no-deps is installed without its requirements. debian: packages of Debian for machines where pip
+            fails.
+        least: the oldest Python that its newest wheel supports. note: remarks on the installation.
     """
 
     title: str
@@ -59,7 +60,7 @@ DISTRIBUTIONS = {
 
 
 def _pythons() -> Iterator[tuple[tuple[int, int], str]]:
-    """Pythons of this machine that run, newest of those that wheels are made for first."""
+    """Pythons of this machine that run; the newest of those with wheels for most packages come first."""
     found = [shutil.which(f"python3.{minor}") for minor in (12, 13, 11)]
     beside = sorted(Path(sys.base_prefix).parent.glob("3.*/bin/python3"))
     for path in (sys.executable, *found, *map(str, beside)):
@@ -72,16 +73,16 @@ def _pythons() -> Iterator[tuple[tuple[int, int], str]]:
 
 
 def _run(*command: str) -> str:
-    """The last line of what a command says against it, "" where it ends well."""
+    """The last line of the error message of a command, "" where it succeeds."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = [line for line in (done.stderr or done.stdout).strip().splitlines() if not line.startswith("WARNING")]
     return "" if done.returncode == 0 else next(iter(lines[-1:]), f"exit code {done.returncode}")
 
 
 def install(name: str) -> str:
-    """Make a peer's environment where it is not there yet; why it cannot be, "" where it is.
+    """Make a peer's environment if it does not exist; returns why it cannot be made, "" on success.
 
-    What Debian or this Python has serves only where pip cannot: it may be years older.
+    Debian's package, or one in this Python, is used only where pip fails, since it may be years older.
     """
     peer, folder = PEERS[name], FOLDER / name
     if Path(_in(folder)).exists() and imports(name):
@@ -104,7 +105,7 @@ def _in(folder: Path) -> str:
 
 
 def python_of(name: str) -> str:
-    """The Python of a peer: its environment's, Debian's, or this one, where it is there already."""
+    """The Python of a peer: that of its environment, Debian's, or this one, whichever exists first."""
     own = _in(FOLDER / name)
     if name == OURS:
         return sys.executable
@@ -114,7 +115,7 @@ def python_of(name: str) -> str:
 
 
 def imports(name: str) -> bool:
-    """Whether its Python can import it."""
+    """Whether the peer's Python can import it."""
     return not _run_in(python_of(name), "-c", f"import {PEERS[name].module}")[0]
 
 
@@ -126,7 +127,7 @@ def _run_in(python: str, *arguments: str) -> tuple[int, str]:
 
 
 def version_of(name: str) -> str:
-    """Of the peer, as its environment has it."""
+    """Version of the peer in its environment."""
     code, said = _run_in(
         python_of(name), "-c", f"from importlib.metadata import version; print(version({DISTRIBUTIONS[name]!r}))"
     )
@@ -137,7 +138,7 @@ def version_of(name: str) -> str:
 
 
 def ask(name: str, jobs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What a peer makes of jobs (beside.worker), in a process of its own."""
+    """Answers of a peer to jobs (beside.worker), from a process of its own."""
     if not jobs:
         return []
     with tempfile.TemporaryDirectory() as folder:

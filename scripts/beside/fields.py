@@ -1,4 +1,4 @@
-"""Fields by their lines: the small-size league's beside ssl-vision's method, and SoccerNet beside published answers."""
+"""Fields with lines: the small-size league's with ssl-vision's method, and SoccerNet's with published answers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _PINHOLE = Options(lens="brown", fixed=dict.fromkeys(("k1", "k2", "p1", "p2", "k
 
 
 def ssl_rows(runs: int) -> list[dict[str, Any]]:
-    """Mean error over the field at each height, the median over the seeds, by scene, noise and method."""
+    """Mean error over the field at each height, median over the seeds, for each scene, noise and method."""
     found = []
     for scene in SSL_PROBLEMS:
         for noise in NOISES:
@@ -52,7 +52,7 @@ def ssl_rows(runs: int) -> list[dict[str, Any]]:
 
 
 def program_rows() -> list[dict[str, Any]]:
-    """What ssl-vision's own program left, measured earlier and elsewhere (`accuracy.scenes`)."""
+    """Errors of ssl-vision's own program, measured earlier and elsewhere (`accuracy.scenes`)."""
     method = "ssl-vision's program, measured earlier"
     noise = next(iter(NOISES))
     return [
@@ -102,7 +102,7 @@ def _errors_mm(truth: Any, camera: SslCamera, places: Array, height_m: float) ->
 
 
 def soccernet_rows(runs: int, folder: Path | None = None) -> list[dict[str, Any]]:
-    """Ours from the annotated points, a pinhole and by defaults, beside what others answered from the pictures."""
+    """Ours from the annotated points, with a pinhole and by defaults, and published answers from the pictures."""
     folder = folder or real_place() / "soccernet_lines"
     if not folder.is_dir():
         return []

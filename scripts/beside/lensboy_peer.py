@@ -1,7 +1,7 @@
-"""lensboy, as its calibration guide calls it: https://robertleoj.github.io/lensboy/calibration_guide.html
+"""lensboy, called as in its calibration guide: https://robertleoj.github.io/lensboy/calibration_guide.html
 
-calibrate_camera with OpenCVConfig (five coefficients) is its quick example; FULL_14 and PinholeSplinedConfig are what
-it recommends where that does not fit. Outliers are filtered and the board's warp is solved for by default. It states
+calibrate_camera with OpenCVConfig (five coefficients) is its quick example; it recommends FULL_14 and
+PinholeSplinedConfig where these do not fit. By default it removes outliers and solves for the board's warp. It states
 no uncertainty.
 """
 
@@ -27,7 +27,7 @@ def _fit(config: Callable[[Any, int, int], Any], corners: Corners) -> PeerFit:
     parts = zip(np.split(corners.feature, cuts), np.split(corners.pixels, cuts), strict=True)
     frames = [peer.Frame(features.astype(int), pixels) for features, pixels in parts]
     chosen = config(peer, height, width)
-    chosen.initial_focal_length = wide_focal(corners)  # None, its default, but of a wide lens
+    chosen.initial_focal_length = wide_focal(corners)  # None, its default, except for a wide lens
     start = time.perf_counter()
     result = peer.calibrate_camera(corners.board, frames, camera_model_config=chosen)
     seconds = time.perf_counter() - start

@@ -1,8 +1,8 @@
-"""Ten faulty inputs, the same for all: who notices, and who states a small error of a wrong answer?
+"""Ten faulty inputs, the same for all peers: who notices, and who states a small error for a wrong answer?
 
-Sixteen views of a board of 9 x 6 corners, 25 mm apart, before a camera that is known, with 0.15 px of noise; then one
-thing is wrong. "Named": a sentence is printed that says what is wrong. "Said": one is printed that the sound input does
-not get, or corners are taken out. What is wrong with the answer is told by f, cx and cy beside the truth.
+Sixteen views of a board of 9 x 6 corners, 25 mm apart, in front of a known camera, with 0.15 px of noise; each input
+has one fault. "Named": a message says what is wrong. "Said": a message is printed that the correct input does not
+cause, or corners are removed. Errors of f, cx and cy show how wrong the answer is.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ ASKED: Mapping[str, str] = {
     OURS: "audit", "opencv": "default", "mrcal": "default", "pycolmap": "OPENCV", "calibsense": "audit",
     "lensboy": "default",
 }  # fmt: skip
-"""The setting that says most of itself."""
+"""The setting of each peer that reports most."""
 WRONG_SDS, WRONG_TIMES = 5.0, 3.0
-"""Standard deviations of f, cx or cy, or times the stated error of projections, beyond which an answer is wrong."""
+"""An answer is wrong beyond so many standard deviations of f, cx or cy, or times the stated error of projections."""
 SOUND_SD_PX = {"fx": 2.0, "phi": 2.0, "cx": 0.8, "cy": 0.8}
-"""About what OpenCV states of the sound input, in px: for an answer that states nothing of the kind."""
+"""Approximately the sigmas that OpenCV states for the correct input, in px, for answers that state no uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class Fault:
     """One faulty input.
 
     Attributes:
-        words: what a sentence must hold to name it. what: for the page. scale: what lengths are multiplied by.
+        words: pattern that a message must contain to name the fault. what: for the page. scale: factor of the lengths
+            in the answer.
     """
 
     what: str
@@ -75,7 +76,7 @@ def _seen(pose: Array, board: Array, values: Array = TRUTH) -> Array:
 
 
 def sound(board: Array | None = None, values: Callable[[int], Array] = lambda view: TRUTH) -> Corners:
-    """The views as they are, or of another board, or by a camera that is not the same throughout."""
+    """The correct views, or views of another board, or by a camera that changes from view to view."""
     rng = np.random.default_rng(5)
     pixels = np.vstack([_seen(p, _board() if board is None else board, values(n)) for n, p in enumerate(_poses())])
     count = len(_board())
@@ -118,8 +119,8 @@ def _repeated(corners: Corners) -> Corners:
 
 
 def _blurred(corners: Corners) -> Corners:
-    """Every third view is rendered with a motion of the camera in it, 14 px at its middle, and measured as OpenCV does
-    (cornerSubPix).
+    """Every third view is rendered with a motion of the camera, 14 px at its middle, and measured with OpenCV's
+    cornerSubPix.
     """
     pixels, count = corners.pixels.copy(), len(_board())
     for view, pose in list(enumerate(_poses()))[::3]:
@@ -131,7 +132,7 @@ def _blurred(corners: Corners) -> Corners:
 
 
 def _picture(pose: Array, moments: Array) -> Any:
-    """A board as the camera sees it while it turns by 14 px about its y axis and rolls a little."""
+    """A board seen by the camera while it turns by 14 px about its y axis and rolls a little."""
     x, y = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
     matrix = np.array([[TRUTH[0], 0.0, TRUTH[2]], [0.0, TRUTH[1], TRUTH[3]], [0.0, 0.0, 1.0]])
     pixels = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
@@ -207,7 +208,7 @@ def tasks(peers: Sequence[str], folder: Path, faults: Sequence[str] = tuple(FAUL
 
 
 def rows(given: Sequence[Task], found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Of each fault and peer: what it says of it, and how wrong its answer is beside what it states."""
+    """For each fault and peer: its messages, and the errors of its answer beside the stated ones."""
     usual = {task.peer: one for task, one in zip(given, found, strict=True) if task.name == SOUND}
     return [_row(task, one, usual[task.peer]) for task, one in zip(given, found, strict=True)]
 
@@ -230,12 +231,12 @@ def _row(task: Task, one: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[s
 
 
 def _kind(line: str) -> str:
-    """A sentence without its numbers."""
+    """A message without its numbers."""
     return re.sub(r"[-+\d.e±]+", "#", line)[:40]
 
 
 def _wrong(one: Mapping[str, Any], fault: Fault) -> dict[str, Any]:
-    """How far the answer is off, in its own standard deviations where it states them."""
+    """Errors of the answer, in its own standard deviations where it states them."""
     names = {name: number for number, name in enumerate(one["names"])}
     truth = {"fx": TRUTH[0], "phi": TRUTH[0], "cx": TRUTH[2], "cy": TRUTH[3]}
     known = [name for name in truth if name in names]

@@ -1,8 +1,8 @@
-"""mrcal by its own program, unchanged: mrcal-calibrate-cameras reads the corners from a file.
+"""mrcal by its own unchanged program: mrcal-calibrate-cameras reads the corners from a file.
 
-Called as https://mrcal.secretsauce.net/how-to-calibrate.html says: LENSMODEL_OPENCV8 first, the splined stereographic
-model as what it recommends; the board's warp, outlier rejection and regularization are on by default
-(mrcal-calibrate-cameras --help). What it states is mrcal.projection_uncertainty
+It is called as in https://mrcal.secretsauce.net/how-to-calibrate.html: with LENSMODEL_OPENCV8 first, and with the
+splined stereographic model, which it recommends. The board's warp, outlier rejection and regularization are on by
+default (mrcal-calibrate-cameras --help). Its uncertainty is mrcal.projection_uncertainty
 (https://mrcal.secretsauce.net/uncertainty.html).
 """
 
@@ -29,7 +29,7 @@ SPLINED = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={columns}_Ny={rows}_fov_x_
 
 
 def _table(corners: Corners) -> Iterator[str]:
-    """A row for each corner of the grid in each picture, as its corners cache has them."""
+    """A row for each corner of the grid in each picture, in the format of its corners cache."""
     count = int(np.prod(corners.grid))
     yield "# filename x y level"
     cuts = np.searchsorted(corners.view, np.arange(1, corners.frames))
@@ -44,7 +44,7 @@ def _table(corners: Corners) -> Iterator[str]:
 
 
 def focal_guess(corners: Corners) -> float:
-    """What its option asks for, px: OpenCV's own start, within what lenses have, or that of a wide lens."""
+    """Focal length for its option, px: OpenCV's initial estimate, clipped, or that of a wide lens."""
     if (focal := wide_focal(corners)) is not None:
         return focal
     objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
@@ -55,7 +55,7 @@ def focal_guess(corners: Corners) -> float:
 
 
 def field_of_view(corners: Corners, focal: float) -> float:
-    """Degrees that the splined model must span: those of an equidistant lens, and a tenth more."""
+    """Degrees that the splined model must cover: those of an equidistant lens, and ten per cent more."""
     return float(np.clip(np.rad2deg(1.1 * float(corners.image_size[0]) / focal), 40.0, 200.0))
 
 
@@ -66,7 +66,7 @@ def splined(columns: int, corners: Corners) -> str:
 
 
 def program() -> str:
-    """Its tool: beside the Python of its environment, or where Debian puts it."""
+    """Path of its tool: beside the Python of its environment, or Debian's."""
     beside = Path(sys.executable).with_name("mrcal-calibrate-cameras")
     return str(beside) if beside.exists() else "/usr/bin/mrcal-calibrate-cameras"
 
@@ -126,7 +126,7 @@ def fitted_of(mrcal: Any, model: Any, corners: Corners, seconds: float, printed:
 
 
 def _solve_alone(corners: Corners) -> PeerFit:
-    """Its solver from its own seed, as the benchmark of this package times it: no program around it, no warp."""
+    """Its solver from its own seed, as the benchmark of this package times it, without its program and warp."""
     found = solve_mrcal(corners)
     mrcal: Any = import_module("mrcal")
 

@@ -1,10 +1,10 @@
-"""OpenCV, and what ROS and Kalibr ask of its solver and its lenses.
+"""OpenCV, and the options with which ROS and Kalibr use its solver and its lenses.
 
-Called as https://docs.opencv.org/5.x/dc/dbb/tutorial_py_calibration.html says; `released` is calibrateCameraRO, which
-solves for the board too (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html, "a more accurate camera calibration
-with imprecise targets"). ROS' camera_calibration calls calibrateCamera with two radial coefficients and k3 held
-(https://docs.ros.org/en/rolling/p/camera_calibration/, `--k-coefficients 2`). Kalibr's pinhole-equi is the lens of
-cv2.fisheye (https://github.com/ethz-asl/kalibr/wiki/supported-models); its own estimator is not run here.
+It is called as in https://docs.opencv.org/5.x/dc/dbb/tutorial_py_calibration.html. `released` is calibrateCameraRO,
+which also solves for the board (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html, "a more accurate camera
+calibration with imprecise targets"). ROS' camera_calibration calls calibrateCamera with two radial coefficients and
+fixed k3 (https://docs.ros.org/en/rolling/p/camera_calibration/, `--k-coefficients 2`). Kalibr's pinhole-equi is the
+lens of cv2.fisheye (https://github.com/ethz-asl/kalibr/wiki/supported-models); Kalibr's estimator is not run here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from beside.starts import wide_focal
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _BESIDE_DEG = 80.0
-_cv: Any = cv2  # which takes more than its stubs say, and numbers its flags elsewhere in each release
+_cv: Any = cv2  # its stubs are incomplete, and the values of its flags change between releases
 FISHEYE = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 
 
@@ -33,7 +33,7 @@ def brown(places: Array, values: Array) -> Array:
 
 
 def fisheye(places: Array, values: Array) -> Array:
-    """The same by cv2.fisheye, in whose formulas a place beside or behind the camera is seen too."""
+    """The same with the formulas of cv2.fisheye, which also project places beside or behind the camera."""
     fx, fy, cx, cy, *lens = values
     aside = np.linalg.norm(places[:, :2], axis=1)
     angle = np.arctan2(aside, places[:, 2])
@@ -77,13 +77,13 @@ def _fit(flags: int, coefficients: int, fixed: tuple[str, ...], corners: Corners
 
 
 def _plain(corners: Corners) -> PeerFit:
-    """calibrateCamera, which states no deviations: what is timed."""
+    """calibrateCamera, which states no standard deviations; this is timed."""
     found = solve_opencv(corners)
     return PeerFit(NAMES[:9], found.intrinsics, brown, corners.board, seconds=found.seconds)
 
 
 def _released(flags: int, coefficients: int, corners: Corners) -> PeerFit:
-    """Every view must show every corner: those that do not are left out."""
+    """Every view must show every corner; the other views are left out."""
     count = len(corners.board)
     objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
     whole = [number for number, one in enumerate(images) if len(one) == count]
@@ -99,8 +99,8 @@ def _released(flags: int, coefficients: int, corners: Corners) -> PeerFit:
 
 
 def _fisheye(corners: Corners) -> PeerFit:
-    """From nothing, or from a wide lens's focal length. Its start takes no corner beside the camera: where it stops at
-    one, it is given those up to 80 degrees off the axis.
+    """Without an initial estimate, or with a wide lens's focal length. Its initial estimate fails for corners beside
+    the camera; where it does, it gets only corners up to 80 degrees from the axis.
     """
     flags = _cv.CALIB_RECOMPUTE_EXTRINSIC | _cv.CALIB_FIX_SKEW
     matrix, focal = None, wide_focal(corners)

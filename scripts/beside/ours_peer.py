@@ -1,4 +1,4 @@
-"""ceres-cal, as docs/python.md calls it: Observations of the corners, and calibrate by its defaults or with a lens."""
+"""ceres-cal, called as in docs/python.md: Observations of the corners, and calibrate with defaults or with a lens."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ceres_cal.scene.targets import checkerboard
 
 
 def observations_of(corners: Corners) -> Observations:
-    """The corners as our observations; no sigma is stated, as with the others."""
+    """The corners as our observations; no sigma is stated, as for the other peers."""
     columns, rows = corners.grid.tolist()
     width, height = corners.image_size.tolist()
     views = tuple(View(f"{n:05d}", "camera", "camera", "board", f"{n:05d}") for n in range(corners.frames))
@@ -63,7 +63,7 @@ def fitted_of(calibration: Calibration, corners: Corners, seconds: float) -> Pee
 
 
 def _board(calibration: Calibration, corners: Corners) -> Array:
-    """Where the corners lie, as built."""
+    """Places of the corners on the board as built."""
     count = len(corners.board)
     one = Corners(
         corners.image_size, corners.grid, corners.square_m, np.zeros(count, np.int32), np.arange(count, dtype=np.int32),
@@ -73,7 +73,7 @@ def _board(calibration: Calibration, corners: Corners) -> Array:
 
 
 def _audited(corners: Corners) -> PeerFit:
-    """By its two commands, `calibrate` and `diagnose`, with what they print."""
+    """The two commands `calibrate` and `diagnose`, with their output."""
     with tempfile.TemporaryDirectory() as name:
         given, found = Path(name) / "observations.json", Path(name) / "calibration.json"
         observations_of(corners).save(given)
@@ -91,7 +91,7 @@ def _audited(corners: Corners) -> PeerFit:
 
 
 def _sentences(printed: str) -> Iterator[str]:
-    """Of its output, those that say what is the matter, each on one line."""
+    """The sentences of the output that report a problem, each on one line."""
     lines: list[str] = []
     for line in printed.splitlines():
         if line.startswith(" ") and lines:

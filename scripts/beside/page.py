@@ -1,4 +1,4 @@
-"""docs/peers.md of the answers that are stored: the tables, and the words around them from peers.md.in."""
+"""docs/peers.md from the stored answers: the tables, and the text around them from peers.md.in."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MARK = re.compile(r"^\{\{(\w+)\}\}$", re.MULTILINE)
 
 
 def _figure(value: float | None, digits: int = 3) -> str:
-    """Of so many digits; a dash where there is none. More than 10 000 of anything here is a lens out of its range."""
+    """The value with so many digits; a dash if there is none. Values above 10 000 mean a lens outside its range."""
     if value is None or value != value:
         return "-"
     if value > 10_000:
@@ -59,12 +59,12 @@ def _by_set(
 
 
 def truth_numbers(found: _Found) -> list[str]:
-    """Each number's difference over what is stated."""
+    """Difference of each number over its stated standard deviation."""
     return _by_set(found.get("truth", ()), lambda row: _figure(row.get("numbers")), lambda row: "numbers" in row)
 
 
 def truth_projections(found: _Found) -> list[str]:
-    """The same of projections, with what the two halves differ by."""
+    """The same for projections, with the difference between the two halves."""
 
     def cell(row: Mapping[str, Any]) -> str:
         return f"{_figure(row['projections'])} ({_figure(row['apart_px'], 2)} px)"
@@ -73,7 +73,7 @@ def truth_projections(found: _Found) -> list[str]:
 
 
 def over_predicted(found: _Found) -> list[str]:
-    """Held-out error over the predicted one, of the default of each that states a noise."""
+    """Held-out error over the predicted error, for the default of each peer that states a noise."""
 
     def kept(row: Mapping[str, Any]) -> bool:
         return "over_predicted" in row and row["setting"] in ("default", "OPENCV", "fisheye", "as drawn")
@@ -82,7 +82,7 @@ def over_predicted(found: _Found) -> list[str]:
 
 
 def prediction(found: _Found) -> list[str]:
-    """By default, and by that of its settings that predicts best."""
+    """Held-out error with the default, and with the setting that predicts best."""
     rows = [row for row in found.get("prediction", ()) if "rms_px" in row]
     sets = _names(rows, "set", list(SOURCES))
     peers = _names(rows, "peer", list(TITLES))
@@ -128,7 +128,7 @@ def soccernet(found: _Found) -> list[str]:
 
 
 def corners(found: _Found) -> list[str]:
-    """Seconds from corners to a result, of a whole process, and MiB that it held: of the fewest frames and the most."""
+    """Seconds of a solve and of a whole process, and MiB, for the smallest and largest number of frames."""
     rows = found.get("corners", ())
     each = sorted({row["frames"] for row in rows})
     ends = list(dict.fromkeys(each[:1] + each[-1:]))
@@ -142,7 +142,7 @@ def corners(found: _Found) -> list[str]:
 
 
 def photographs(found: _Found) -> list[str]:
-    """Seconds, and of a processor, from photographs to a result."""
+    """Elapsed and processor seconds from photographs to a result."""
     rows = found.get("photographs", ())
     methods = list(dict.fromkeys(row["method"] for row in rows))
     cells = {
@@ -157,7 +157,7 @@ def photographs(found: _Found) -> list[str]:
 
 
 def lies(found: _Found) -> list[str]:
-    """Of each fault: what is said of it, and what the answer is worth."""
+    """For each fault: what is reported, and whether the answer is right."""
     rows = found.get("lies", ())
     peers = _names(rows, "peer", list(TITLES))
     cells = {(row["fault"], row["peer"]): _lie(row) for row in rows}
@@ -180,7 +180,7 @@ def _lie(row: Mapping[str, Any]) -> str:
 
 
 def counts(found: _Found) -> list[str]:
-    """Of the ten faults: noticed, and wrong without a word."""
+    """Of the ten faults: number of those named, noticed, and wrong without a message."""
     rows = [row for row in found.get("lies", ()) if row["fault"] != "sound"]
     lines = []
     for peer in _names(rows, "peer", list(TITLES)):
@@ -196,7 +196,7 @@ def counts(found: _Found) -> list[str]:
 
 
 def versions(found: _Found) -> list[str]:
-    """What was asked, by version."""
+    """Versions of the peers."""
     there = found.get("environment", {})
     lines = [[TITLES[name], version] for name, version in there.get("versions", {}).items()]
     lines += [[TITLES[name], f"not installed: {why}"] for name, why in there.get("missing", {}).items()]
@@ -204,7 +204,7 @@ def versions(found: _Found) -> list[str]:
 
 
 def sets(found: _Found) -> list[str]:
-    """Where the sets are from."""
+    """Sources of the sets."""
     return _table(
         ["set", "what", "where", "licence"],
         [[name, one.what, one.where, one.licence] for name, one in SOURCES.items()],

@@ -1,6 +1,6 @@
-"""What a calibration by anybody is judged by: a camera to project with, a board, and what is stated of both.
+"""Measures by which any calibration is judged: a camera to project with, a board, and the stated uncertainties.
 
-Needs NumPy and OpenCV, nothing of this package: it runs under each peer's own Python.
+Needs only NumPy and OpenCV, nothing of this package, since it runs in each peer's own Python.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.peers import Array, Corners
 
 _STEP = 1e-5
-_AHEAD = 0.17  # cosine of the angle off the axis up to which a place is used for the start of a pose
+_AHEAD = 0.17  # cosine of the largest angle from the axis for the initial estimate of a pose
 _ROUNDS = 30
 _WARPED = 0.002
 
@@ -24,12 +24,12 @@ class PeerFit:
     """A calibrated camera.
 
     Attributes:
-        values: (K,) what was solved for of the camera, in the peer's own terms, by `names`. project: (N, 3) in the
-            camera's frame and values (K,) -> (N, 2) px. board: (M, 3) m as drawn or as the peer found it.
+        values: (K,) solved numbers of the camera in the peer's own parametrisation, with these `names`.
+        project: (N, 3) in the camera's frame and values (K,) -> (N, 2) px. board: (M, 3) m as drawn or as solved for.
         sd: (K,) stated standard deviations. covariance: (K, K) stated. variance: places (N, 3), at_infinity -> (N,)
-            px^2, what the peer itself states of a projection there, both coordinates together. noise_px: standard
-            deviation of a corner's coordinate that the peer states. Each is None or NaN where it states none.
-        said: what it says of its own. taken_out: corners that it left out. seconds: of the solve.
+            px^2, the stated variance of a projection there, sum of both coordinates. noise_px: stated standard
+            deviation of a corner's coordinate. Each is None or NaN where the peer states none.
+        said: the peer's messages. taken_out: number of corners that it removed. seconds: of the solve.
     """
 
     names: tuple[str, ...]
@@ -50,7 +50,7 @@ class PeerFit:
         return self.project(places, self.values)
 
     def rays(self, pixels: Array) -> Array:
-        """(N, 3) unit rays of pixels (N, 2), by Gauss-Newton on `project`; NaN where it does not come to rest."""
+        """(N, 3) unit rays of pixels (N, 2), by Gauss-Newton on `project`; NaN where it does not converge."""
         scale = max(float(self.values[0]), 1.0)
         middle = self.seen(np.array([[0.0, 0.0, 1.0]]))[0]
         off = (pixels - middle) / scale
@@ -69,7 +69,7 @@ class PeerFit:
         return rays
 
     def slopes(self, places: Array) -> Array:
-        """(2 N, K) px by which places are seen elsewhere per unit of each of the values."""
+        """(2 N, K) derivatives of the pixels of places with respect to the values, px per unit of each."""
         usual = _STEP * np.maximum(np.abs(self.values), 1e-2)
         steps = usual if self.sd is None else np.where(self.sd > 0.0, 0.03 * self.sd, usual)
         columns = []
@@ -80,8 +80,8 @@ class PeerFit:
         return np.column_stack(columns)
 
     def stated_squares(self, rays: Array, basis: Array, *, at_infinity: bool) -> Array | None:
-        """(N,) px^2, the stated variance of where rays are seen, both coordinates together; the columns of a basis
-        (2 N, k) are taken out of what a covariance states. None where nothing is stated.
+        """(N,) px^2, the stated variance of the pixels of rays, sum of both coordinates. The columns of a basis (2 N,
+        k) are projected out of a stated covariance. None where nothing is stated.
         """
         if self.variance is not None:
             return self.variance(rays, at_infinity=at_infinity)
@@ -93,25 +93,25 @@ class PeerFit:
 
 
 def warp_said(board: Array) -> list[str]:
-    """What a solved board is worth a sentence for: when it is off its plane by more than a five-hundredth of it."""
+    """A message for a solved board that deviates from its plane by more than a five-hundredth of its size."""
     deep, wide = float(np.ptp(board[:, 2])), float(np.ptp(board[:, :2], axis=0).max())
     return [f"the board is warped by {1e3 * deep:.2f} mm"] if deep > _WARPED * wide else []
 
 
 def _of_turns(turn: Array) -> Array:
-    """(N, 3) unit rays off the axis by an angle |turn| in its direction."""
+    """(N, 3) unit rays that leave the axis by an angle |turn| in its direction."""
     angle = np.linalg.norm(turn, axis=1)
     return np.column_stack([turn * np.sinc(angle / np.pi)[:, None], np.cos(angle)])
 
 
 def turn_basis(fitted: PeerFit, rays: Array) -> Array:
-    """(2 N, 3) orthonormal basis of how the places at which rays are seen move when the camera turns."""
+    """(2 N, 3) orthonormal basis of the pixel displacements of rays under rotations of the camera."""
     columns = [(fitted.seen(rays + _STEP * np.cross(a, rays)) - fitted.seen(rays)).ravel() for a in np.eye(3)]
     return np.asarray(np.linalg.qr(np.column_stack(columns))[0])
 
 
 def grid_of(corners: Corners, step: int = 12) -> Array:
-    """(N, 2) a grid of pixels over the part of the image that the corners of all views enclose."""
+    """(N, 2) a grid of pixels in the convex hull of the corners of all views."""
     width, height = corners.image_size.tolist()
     size = max(width, height) / step
     x, y = (np.arange(0.5 * size, most, size) for most in (width, height))
@@ -124,8 +124,8 @@ def grid_of(corners: Corners, step: int = 12) -> Array:
 
 
 def agreement(first: PeerFit, second: PeerFit, pixels: Array) -> dict[str, float]:
-    """Mean squares of what two calibrations from different pictures differ by, over what both state: of each number by
-    itself, and of projections, the rotation between the two that fits best taken out. What is not stated is not there.
+    """Mean squares of the differences of two calibrations from different pictures over what both state: of each number,
+    and of projections after the best-fitting rotation between the two. Values that are not stated are missing.
     """
     found: dict[str, float] = {}
     if first.sd is not None and second.sd is not None and first.names == second.names:
@@ -148,12 +148,12 @@ def agreement(first: PeerFit, second: PeerFit, pixels: Array) -> dict[str, float
     return found
 
 
-# ---- views that a calibration has not seen --------------------------------------------------------------------------
+# ---- held-out views -------------------------------------------------------------------------------------------------
 
 
 def held_out(fitted: PeerFit, corners: Corners) -> tuple[Array, Array]:
-    """(N,) px that a camera leaves of new views, of which it solves for the poses alone; and (N,) px^2 of the squares
-    that it predicts of itself, NaN where it states no noise.
+    """(N,) px, residuals of new views for which only the poses are solved; and (N,) px^2, their predicted squares, NaN
+    where the peer states no noise.
     """
     lengths, expected = [], []
     cuts = np.searchsorted(corners.view, np.arange(1, corners.frames))
@@ -174,8 +174,8 @@ def _moved(pose: Array, board: Array) -> Array:
 
 
 def _posed(fitted: PeerFit, board: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Least squares over one pose, corners far beyond the others left out of it: pose (6,), what is left (2 N,) and
-    its slopes (2 N, 6). Of the two poses that a plane's picture allows it is the better one.
+    """Least squares for one pose without corners far beyond the others: pose (6,), residuals (2 N,) and their
+    derivatives (2 N, 6). It is the better one of the two poses that the picture of a plane allows.
     """
 
     def left_at(pose: Array) -> Array:

@@ -1,9 +1,9 @@
-"""COLMAP's bundle adjustment through pycolmap, the board's corners held.
+"""COLMAP's bundle adjustment through pycolmap, with the board's corners fixed.
 
-https://colmap.github.io/cameras.html lists its lenses, https://colmap.github.io/pycolmap/ the calls; COLMAP has no
-command that calibrates from boards. "default" leaves every option of BundleAdjustmentOptions as it comes, which holds
-the principal point, with SIMPLE_RADIAL, the lens that its reader takes; the other settings free it, as its FAQ says of
-calibrating. What it states is estimate_ba_covariance, times the noise found.
+https://colmap.github.io/cameras.html lists its lenses, https://colmap.github.io/pycolmap/ its calls; COLMAP has no
+command for calibration with boards. "default" uses every default of BundleAdjustmentOptions, with a fixed principal
+point, and SIMPLE_RADIAL, the default lens of its reader. The other settings free the principal point, as its FAQ
+recommends for calibration. The stated uncertainty is estimate_ba_covariance times the estimated noise.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from beside.opencv_peer import fisheye
 from beside.peer_fit import PeerFit
 from beside.starts import wide_focal, wide_poses
 
-HALF = 0.5  # its pixels count from the corner of the first
+HALF = 0.5  # the centre of its first pixel is (0.5, 0.5)
 _NAMES = {
     "SIMPLE_RADIAL": ("fx", "cx", "cy", "k1"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
@@ -31,7 +31,7 @@ _NAMES = {
 
 
 def _scene(model: str, corners: Corners) -> Any:
-    """The corners as a reconstruction, at OpenCV's start, or at that of a wide lens."""
+    """The corners as a reconstruction at OpenCV's initial estimate, or at that of a wide lens."""
     peer = import_module("pycolmap")
     width, height = corners.image_size.tolist()
     focal, middle = wide_focal(corners), (0.5 * width, 0.5 * height)
@@ -53,7 +53,7 @@ def _scene(model: str, corners: Corners) -> Any:
         for place, feature in enumerate(features.tolist()):
             tracks[feature].add_element(number + 1, place)
     for place_m, track in zip(corners.board, tracks, strict=True):
-        if track.length() > 1:  # its bundle adjustment takes no point of one picture
+        if track.length() > 1:  # its bundle adjustment does not accept a point in a single picture
             scene.add_point3D(place_m, track)
     return scene
 
@@ -77,7 +77,7 @@ def _fit(model: str, loss: str, principal_point: bool, corners: Corners) -> Peer
     values = np.array(scene.cameras[1].params) - [HALF * (name in ("cx", "cy")) for name in names]
 
     def project(places: Array, values: Array) -> Array:
-        if model == "OPENCV_FISHEYE":  # the same lens; it has a place beside the camera, too
+        if model == "OPENCV_FISHEYE":  # the same lens, which also projects places beside the camera
             return fisheye(places, values)
         raised = values + [HALF * (name in ("cx", "cy")) for name in names]
         width, height = corners.image_size.tolist()
@@ -93,7 +93,7 @@ def _stated(
     peer: Any, adjuster: Any, scene: Any, corners: Corners, names: tuple[str, ...], principal_point: bool,
     project: Callable[[Array, Array], Array], values: Array,
 ) -> tuple[float, Array | None, Array | None]:  # fmt: skip
-    """Its covariance of the camera times the variance of what is left."""
+    """Its covariance of the camera times the variance of the residuals."""
     left = []
     for number, (on_board, pixels) in enumerate(zip(*corners.by_frame(), strict=True)):
         pose = scene.images[number + 1].cam_from_world().matrix()

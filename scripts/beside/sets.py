@@ -1,4 +1,4 @@
-"""The real sets of boards as corners that every peer takes, by their public names and how to get them."""
+"""The real sets of boards as corners that every peer takes, with their public names and sources."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SAMPLE = Path(__file__).resolve().parents[2] / "data" / "opencv_left"
 
 @dataclass(frozen=True)
 class Source:
-    """Where a set comes from, and its licence."""
+    """Source of a set, and its licence."""
 
     what: str
     where: str
@@ -66,7 +66,7 @@ SOURCES: Mapping[str, Source] = {
 
 
 def corners_of(observations: Observations) -> Corners:
-    """Of one camera before one checkerboard, its views numbered in order."""
+    """Corners of one camera and one checkerboard; its views are numbered in order."""
     ((width, height),) = observations.cameras.values()
     (target,) = observations.targets.values()
     places = target.point_array
@@ -87,14 +87,14 @@ def is_there(name: str) -> bool:
 
 
 def real_corners(name: str) -> Corners:
-    """The corners that `detect board` finds, or those that a set comes with."""
+    """The corners that `detect board` finds, or those stored with a set."""
     if name == SAMPLE:
         return corners_of(detect_boards(sorted(_SAMPLE.glob("*.jpg")), checkerboard(9, 6, 0.025)).observations)
     return corners_of(REAL[name]())
 
 
 def of_views(corners: Corners, chosen: Any) -> Corners:
-    """Some of the views, numbered anew."""
+    """Some of the views, with new numbers."""
     rows = chosen[corners.view]
     _, view = np.unique(corners.view[rows], return_inverse=True)
     return Corners(

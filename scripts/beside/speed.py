@@ -1,7 +1,7 @@
-"""Time and memory: corners to a result, whole processes, photographs to a result. Best of several turns, in turns.
+"""Time and memory: corners to a result, whole processes, photographs to a result. Best of several turns.
 
-All solve for the nine numbers of OpenCV's default lens from a cold start. A whole process reads the corners, imports
-its library, calibrates and ends; mrcal's is its program. Memory is the most that such a process has held.
+All solve for the nine numbers of OpenCV's default lens without an initial estimate. A whole process reads the corners,
+imports its library, calibrates and ends; mrcal's is its program. Memory is the peak memory of such a process.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks.photographs import _OPENCV, _OURS, BoardSet, board_sets
 from benchmarks.problems import wide_lens
-from benchmarks.process import Spent
+from benchmarks.process import Cost
 
 from beside.environments import OURS, python_of
 
@@ -28,14 +28,14 @@ SOLVED: Mapping[str, str] = {
     "calibsense": "default", "lensboy": "default",
 }  # fmt: skip
 DEFAULTS: Mapping[str, str] = {OURS: "default"}
-"""What else is timed of some."""
+"""Additional settings that are timed."""
 _WORKER = Path(__file__).with_name("worker.py")
 _REPEAT = 3
 _LONG_S = 20.0  # a solve after which its process is not repeated
 
 
 def corner_rows(peers: Sequence[str], frames: Sequence[int], turns: int) -> list[dict[str, Any]]:
-    """Of each number of frames and peer: the best solve, the best whole process, and its memory."""
+    """For each number of frames and peer: the fastest solve, the fastest whole process, and its memory."""
     rows = []
     with tempfile.TemporaryDirectory() as name:
         for count in frames:
@@ -60,7 +60,7 @@ def _row(count: int, peer: str, setting: str, said: Sequence[Mapping[str, Any]])
 
 
 def _turn(peer: str, setting: str, path: Path, folder: Path) -> dict[str, Any]:
-    """One whole process with a single solve, then one with several, of which the best counts."""
+    """One whole process with a single solve, then one with several; the fastest solve counts."""
     once, spent = _process(peer, setting, path, folder, 1)
     if "refused" in once:
         return once
@@ -70,7 +70,7 @@ def _turn(peer: str, setting: str, path: Path, folder: Path) -> dict[str, Any]:
     return found | {"solve_s": best, "long": long}
 
 
-def _process(peer: str, setting: str, path: Path, folder: Path, repeat: int) -> tuple[dict[str, Any], Spent]:
+def _process(peer: str, setting: str, path: Path, folder: Path, repeat: int) -> tuple[dict[str, Any], Cost]:
     jobs, answers = folder / "jobs.json", folder / "answers.json"
     jobs.write_text(json.dumps([{"task": "timed", "setting": setting, "corners": [str(path)], "repeat": repeat}]))
     used = _spent([python_of(peer), str(_WORKER), peer, str(jobs), str(answers)])
@@ -78,27 +78,27 @@ def _process(peer: str, setting: str, path: Path, folder: Path, repeat: int) -> 
     return found, used
 
 
-def _spent(command: Sequence[str]) -> Spent:
-    """Of one process; another Python must not find this one's packages, and keeps its compiled modules."""
+def _spent(command: Sequence[str]) -> Cost:
+    """Cost of one process; another Python must not find this one's packages, and stores its compiled modules."""
     variables = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     before, start = os.times(), time.perf_counter()
     done = subprocess.run(command, env=variables, capture_output=True, check=False)
     wall, after = time.perf_counter() - start, os.times()
     processor = after.children_user - before.children_user + after.children_system - before.children_system
-    return Spent(wall, processor, done.returncode)
+    return Cost(wall, processor, done.returncode)
 
 
 # ---- photographs ----------------------------------------------------------------------------------------------------
 
 
 def photograph_rows(peers: Sequence[str], turns: int) -> list[dict[str, Any]]:
-    """From photographs of a board to a result, whole processes in turns, of those that find plain boards."""
+    """From photographs of a board to a result, whole processes in turns, for peers that detect plain boards."""
     rows = []
     for one in board_sets():
         with tempfile.TemporaryDirectory() as name:
             programs = _programs(one, peers, Path(name))
-            found: dict[str, list[Spent]] = {key: [] for key in programs}
-            for _ in range(turns + 1):  # the first reads the files; the best counts
+            found: dict[str, list[Cost]] = {key: [] for key in programs}
+            for _ in range(turns + 1):  # the first one fills the file cache; the best counts
                 for key, command in programs.items():
                     if not any(one.wall > _LONG_S for one in found[key]):
                         found[key].append(_spent(command))

@@ -1,10 +1,10 @@
-"""ssl-vision's calibration from four points and the points on lines and arcs, written anew from its description.
+"""ssl-vision's calibration from four points and the points on lines and arcs, rewritten from its description.
 
 It minimises plain squares over focal length, rotation, tx, ty, principal point and one distortion, r_u = r_d (1 + k
-r_d^2) with k >= 0, tz being held at the height that the user enters; each point on a line adds the unknown of where
-it lies along it, which takes the distance along the line out (github.com/RoboCup-SSL/ssl-vision,
-src/shared/util/camera_calibration.cpp, CameraParameters::calibrate). Here that unknown is eliminated, and the start is
-near the truth, both of which help it. Corners and line points weigh the same, as by its defaults.
+r_d^2) with k >= 0, with tz fixed at the height that the user enters. Each point on a line adds an unknown, its position
+along the line (github.com/RoboCup-SSL/ssl-vision, src/shared/util/camera_calibration.cpp,
+CameraParameters::calibrate). Here this unknown is eliminated, and the initial estimate is close to the truth; both are
+to its advantage. Corners and line points have the same weight, as by its defaults.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _STEP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SslCamera:
-    """f, cx, cy, k, and the pose [R t] of the field before it."""
+    """f, cx, cy, k, and the pose [R t] of the field relative to the camera."""
 
     numbers: Array  # (4,) f, cx, cy, k
     rotation: Array
     translation: Array
 
     def moved(self, step: Any) -> SslCamera:
-        """By (9,) f, cx, cy, k, three turns, tx and ty; k stays where the model has a meaning."""
+        """The camera after a step (9,) in f, cx, cy, k, three rotations, tx and ty; k stays at least 0."""
         numbers = self.numbers + step[:4] * (1.0, 1.0, 1.0, 1e-3)
         numbers[3] = max(numbers[3], 0.0)
         shift = self.translation + np.array([*step[7:], 0.0]) * 1e-3
@@ -61,7 +61,7 @@ class SslCamera:
 
 
 def calibrated(start: SslCamera, field: Target, points: tuple[Array, Array], curves: tuple[Array, Array]) -> SslCamera:
-    """The minimum from a start; points and curves as features (N,) and pixels (N, 2)."""
+    """The minimum from an initial camera; points and curves are given as features (N,) and pixels (N, 2)."""
     camera, damping = start, 1e-3
     left = _left(camera, field, points, curves)
     for _ in range(_ROUNDS):
@@ -82,7 +82,7 @@ def calibrated(start: SslCamera, field: Target, points: tuple[Array, Array], cur
 
 
 def _left(camera: SslCamera, field: Target, points: tuple[Array, Array], curves: tuple[Array, Array]) -> Array:
-    """Residuals: both coordinates of points, and of points on curves the distance across."""
+    """Residuals: both coordinates of points, and the perpendicular distance of points on curves."""
     feature, pixels = points
     parts = [(camera.project(field.point_array[feature]) - pixels).ravel()]
     every: Sequence[object] = list(field.curves.values())

@@ -1,7 +1,7 @@
-"""A first guess of a wide lens, for those that ask for one: the focal length of an equidistant lens, by homographies.
+"""Initial focal length of a wide lens, for peers that need one: that of an equidistant lens, by homographies.
 
-OpenCV's own first guess takes a lens for a pinhole. Where an equidistant lens makes the board much flatter than any
-pinhole does, its focal length is handed to each peer that takes one, which helps it.
+OpenCV's own initial estimate assumes a pinhole. Where an equidistant lens explains the board much better than any
+pinhole, its focal length is given to each peer that accepts one, to the peer's advantage.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from benchmarks.peers import Array, Corners
 
-_FLATTER = 0.5  # times what a pinhole leaves, from which down a lens is taken for a wide one
-_MOST = 1.4  # rad off the axis up to which a corner is used
+_FLATTER = 0.5  # times the residuals of a pinhole; with smaller ones a lens is wide
+_MOST = 1.4  # rad, largest angle from the axis of a corner that is used
 _LEAST = 8  # corners of a view
 
 
 def flat_of(pixels: Array, focal: float, middle: Any) -> Array:
-    """(N, 2) where the rays of pixels meet the plane at 1, by an equidistant lens; NaN far off the axis."""
+    """(N, 2) where the rays of pixels meet the plane z = 1 for an equidistant lens; NaN far from the axis."""
     off = (pixels - middle) / focal
     angle = np.linalg.norm(off, axis=1)
     grown = np.where(angle < _MOST, np.tan(np.minimum(angle, _MOST)) / np.maximum(angle, 1e-12), np.nan)
@@ -26,7 +26,7 @@ def flat_of(pixels: Array, focal: float, middle: Any) -> Array:
 
 
 def _left(corners: Corners, focal: float) -> float:
-    """Rms px by which homographies of the board miss the corners straightened by this focal length."""
+    """Rms px of the residuals of homographies to the corners, rectified with this focal length."""
     middle, squares = 0.5 * (corners.image_size - 1.0), []
     for board, pixels in zip(*corners.by_frame(), strict=True):
         flat = flat_of(pixels, focal, middle)
@@ -43,7 +43,7 @@ def _left(corners: Corners, focal: float) -> float:
 
 
 def wide_focal(corners: Corners) -> float | None:
-    """Its focal length, px; None where a pinhole does as well."""
+    """Focal length of a wide lens, px; None where a pinhole fits as well."""
     width = float(corners.image_size[0])
     tried = width * np.geomspace(0.2, 1.5, 30)
     left = [_left(corners, focal) for focal in tried.tolist()]
@@ -52,7 +52,7 @@ def wide_focal(corners: Corners) -> float | None:
 
 
 def wide_poses(corners: Corners, focal: float) -> list[Array]:
-    """(3, 4) cam_from_board of each view under it."""
+    """(3, 4) cam_from_board of each view with this focal length."""
     middle, poses = 0.5 * (corners.image_size - 1.0), []
     for board, pixels in zip(*corners.by_frame(), strict=True):
         flat = flat_of(pixels, focal, middle)

@@ -1,7 +1,7 @@
-"""A peer at work under its own Python: python scripts/beside/worker.py PEER JOBS.json ANSWERS.json
+"""A peer in its own Python: python scripts/beside/worker.py PEER JOBS.json ANSWERS.json
 
-JOBS is a list of tasks, each with a setting and files of corners; an answer is a dictionary, or a refusal. Run so that
-each peer is asked the same by the same code.
+JOBS is a list of tasks, each with a setting and files of corners; an answer is a dictionary, or a refusal. All peers
+are asked by this same code.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ def fitted(peer: str, job: dict[str, Any], corners: Corners) -> PeerFit:
 
 
 def pair(peer: str, job: dict[str, Any]) -> dict[str, Any]:
-    """Two halves of the views: how far their calibrations are apart over what they state."""
+    """Two halves of the views: difference of their calibrations over what they state."""
     halves = [Corners.load(Path(path)) for path in job["corners"]]
     first, second = (fitted(peer, job, half) for half in halves)
     return agreement(first, second, grid_of(Corners.load(Path(job["whole"]))))
 
 
 def predict(peer: str, job: dict[str, Any]) -> dict[str, Any]:
-    """One half calibrated, the other's poses solved for: what is left of each corner, and what was predicted."""
+    """One half is calibrated, the poses of the other half are solved for: residuals, and their predicted squares."""
     known, new = (Corners.load(Path(path)) for path in job["corners"])
     lengths, expected = held_out(fitted(peer, job, known), new)
     return {"lengths": lengths.tolist(), "expected": expected.tolist()}
 
 
 def answer(peer: str, job: dict[str, Any]) -> dict[str, Any]:
-    """The camera itself."""
+    """The camera itself, with its messages and stated uncertainties."""
     (corners,) = (Corners.load(Path(path)) for path in job["corners"])
     found = fitted(peer, job, corners)
     rays = found.rays(np.array(job["pixels"])) if "pixels" in job else np.empty((0, 3))
@@ -64,7 +64,7 @@ def _stated(found: PeerFit, rays: Any) -> list[float] | None:
 
 
 def timed(peer: str, job: dict[str, Any]) -> dict[str, Any]:
-    """Seconds of the first solve and of the best of the later ones, and the most memory held."""
+    """Seconds of the first solve and of the fastest one, and the peak memory."""
     corners = Corners.load(Path(job["corners"][0]))
     first, repeat = time.perf_counter(), job["repeat"]
     fitted(peer, job, corners)
@@ -82,13 +82,13 @@ TASKS = {"pair": pair, "predict": predict, "answer": answer, "timed": timed}
 def work(peer: str, jobs: str, answers: str) -> int:
     jobs_given = json.loads(Path(jobs).read_text(encoding="utf-8"))
     if all(job["task"] != "timed" for job in jobs_given):
-        cv2.setNumThreads(1)  # its threads wait for each other where other processes are at work
+        cv2.setNumThreads(1)  # its threads wait for each other while other processes run
     found = []
     for job in jobs_given:
         start = time.perf_counter()
         try:
             one = TASKS[job["task"]](peer, job)
-        except Exception as error:  # a refusal, whatever its type: it is told
+        except Exception as error:  # an error of any type is a refusal, and is reported
             one = {"refused": f"{type(error).__name__}: {error}"[:400]}
         found.append(one | {"seconds": time.perf_counter() - start})
     Path(answers).write_text(json.dumps(found), encoding="utf-8")

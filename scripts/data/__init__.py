@@ -1,1 +1,1 @@
-"""What makes the sample data, pictures, schemas and outputs in the documents."""
+"""Scripts that make the sample data, pictures, schemas, and the outputs in the documents."""

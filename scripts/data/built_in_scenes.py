@@ -1,4 +1,4 @@
-"""Makes the scenes that come with the package: python scripts/run.py built_in_scenes [FOLDER]"""
+"""Makes the scenes that are part of the package: python scripts/run.py built_in_scenes [FOLDER]"""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ _WORKDAY = Disturbance(
     hidden_length_m=0.7,
     hidden_points=0.1,
 )
-"""An ordinary day at the field: robots and people in the way, and one observation in twenty is wrong."""
+"""An ordinary day at the field: robots and people hide lines, and one observation in twenty is wrong."""
 
 _PAPER_PHI = 736.0
-"""The paper's a1, a2, a3 (section 2), and a phi to go with them (the paper prints none): that of a 4.2 mm lens on a
-third-inch sensor of 780 x 580 pixels, 683 px at the centre, times a1."""
+"""The paper's a1, a2, a3 (section 2), with a phi that the paper does not give: that of a 4.2 mm lens on a third-inch
+sensor of 780 x 580 pixels, 683 px at the centre, times a1."""
 
 
 def _overhead_camera() -> Camera:
-    """1280 x 960, barrel distortion: at the image's corner the measured radius is 0.77 of the ideal one."""
+    """1280 x 960 with barrel distortion: in the image's corner the measured radius is 0.77 of the ideal one."""
     return Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7), (2, 3)))
 
 
@@ -53,7 +53,7 @@ def _station_2004() -> Station:
 
 
 def _field_of_2004() -> Target:
-    """A small field of 4.9 x 3.4 m (the paper gives no size): its outline, halfway line and circle."""
+    """A small field of 4.9 x 3.4 m (the paper does not give its size): outline, halfway line and circle."""
     whole = ssl_field("B", field_length_m=4.9, field_width_m=3.4, center_circle_radius_m=0.5)
     points = [
         *("TopLeftCorner", "TopRightCorner", "BottomLeftCorner", "BottomRightCorner"),
@@ -146,7 +146,7 @@ SCENES: dict[str, Callable[[], tuple[Scene, Disturbance]]] = {
 
 
 def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[str, Any]:
-    """A scene and its disturbance as a file has them; poses come back to rounding, everything else exactly."""
+    """A scene and its disturbance in the format of a file; poses are exact up to rounding, everything else exactly."""
     return {
         "format": SCENE_FORMAT,
         "version": SCENE_VERSION,
@@ -175,7 +175,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
 
 
 def content(name: str) -> dict[str, Any]:
-    """A scene's file: positions as they are meant, and of the disturbance what is not by default."""
+    """Content of a scene's file, with rounded positions, and without default values of the disturbance."""
     data = scene_to_json(*SCENES[name]())
     for one in data["stations"].values():
         one["position_m"] = [round(number, 12) + 0.0 for number in one["position_m"]]

@@ -1,10 +1,9 @@
-"""Runs what documents say to type and compares what is printed: python scripts/run.py documents [--write] [FILE...]
+"""Runs the commands in documents and compares their output: python scripts/run.py documents [--write] [FILE...]
 
-All commands of a document (```console, after "$ ") and its Python (```python) run in the order in which they stand, one
-shell for all, in a copy of the sample data and scripts beside a .venv that leads to this interpreter. A command must
-end with 0. What stands below it is compared, where anything does, with what it prints: text as it is, whole numbers
-exactly (but of iterations), others to one unit of their last digit, as two machines agree to nine digits or so and may
-still round differently. --write puts what was printed in its place.
+All commands of a document (```console, after "$ ") and its Python (```python) run in order in one shell, in a copy of
+the sample data and scripts with a .venv that uses this interpreter. A command must end with exit code 0. The text below
+it, if any, is compared with its output: words and whole numbers exactly (except numbers of iterations), other numbers
+to one unit of their last digit, since two machines may round differently. --write replaces the text by the output.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _MARK = "=== end of command"
 
 @dataclass(frozen=True)
 class Step:
-    """One command, or one piece of Python, of a document; `shown` is what stands below it."""
+    """One command, or one piece of Python, of a document; `shown` is the text below it."""
 
     command: str
     shown: tuple[str, ...] = ()
@@ -43,7 +42,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Run:
-    """What a step printed, and how it ended."""
+    """The output of a step, and its exit code."""
 
     step: Step
     printed: tuple[str, ...]
@@ -52,7 +51,7 @@ class Run:
 
     @property
     def differences(self) -> list[str]:
-        """What the document says otherwise, a line each; none where it is right."""
+        """Differences between the document and the output, one line each; none where the document is right."""
         if self.exit_code:
             return [f"exit code {self.exit_code}: {self.errors.strip()}"]
         if not self.step.shown:
@@ -62,8 +61,8 @@ class Run:
 
 
 def agree(said: str, now: str) -> bool:
-    """Whether two lines say the same: see above."""
-    said, now = (_EFFORT.sub("", line) for line in (said, now))  # what an answer took is not what it is
+    """Whether two lines agree, as described above."""
+    said, now = (_EFFORT.sub("", line) for line in (said, now))  # the number of iterations may differ
     if " ".join(_NUMBER.sub("#", said).split()) != " ".join(_NUMBER.sub("#", now).split()):
         return False
     pairs = zip(_NUMBER.findall(said), _NUMBER.findall(now), strict=True)
@@ -71,7 +70,7 @@ def agree(said: str, now: str) -> bool:
 
 
 def _unit(number: str) -> float:
-    """One of a number's last digit; 0 of whole numbers."""
+    """One unit of a number's last digit; 0 for whole numbers."""
     digits, _, power = number.partition("e")
     places = len(digits.partition(".")[2])
     return 10.0 ** (int(power or 0) - places) if places or power else 0.0
@@ -81,7 +80,7 @@ def _unit(number: str) -> float:
 
 
 def steps_of(text: str) -> list[Step]:
-    """Everything in a document that is to be run, in order."""
+    """All steps of a document, in order."""
     return [step for kind, body in _BLOCK.findall(text) for step in _steps_in(kind, body)]
 
 
@@ -100,7 +99,7 @@ def _steps_in(kind: str, body: str) -> list[Step]:
 
 
 def rewritten(text: str, runs: Sequence[Run]) -> str:
-    """The document with what was printed below each command that has something there."""
+    """The document with the new output below each command that shows an output."""
     rest = iter(runs)
 
     def block(found: re.Match[str]) -> str:
@@ -118,7 +117,7 @@ def rewritten(text: str, runs: Sequence[Run]) -> str:
 
 
 def run(text: str, folder: Path) -> list[Run]:
-    """Run all of a document in a folder that `prepare` made; stops at the first command that fails."""
+    """Run all steps of a document in a folder made by `prepare`; stops at the first command that fails."""
     steps = steps_of(text)
     script = [f"exec 2>{folder}/errors"]
     for number, step in enumerate(steps):
@@ -141,14 +140,14 @@ def run(text: str, folder: Path) -> list[Run]:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """A user's: `ceres-cal` is found once .venv is activated."""
+    """A user's environment: `ceres-cal` is found after .venv is activated."""
     import os
 
     return {**os.environ, "PYTHONPATH": str(ROOT / "src"), "COLUMNS": "100"}
 
 
 def prepare(folder: Path) -> Path:
-    """A copy of what a fresh clone has, and a .venv as `scripts/setup` leaves it."""
+    """A copy of a fresh clone, with a .venv as `scripts/setup` makes it."""
     for name in COPIED:
         if (ROOT / name).is_dir():
             shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -167,7 +166,7 @@ def prepare(folder: Path) -> Path:
 
 
 def differences(path: Path, *, write: bool = False) -> list[str]:
-    """What a document says otherwise than its commands do, after putting that right with `write`."""
+    """Differences between a document and the output of its commands; with `write` the document is corrected."""
     text = path.read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as folder:
         runs = run(text, prepare(Path(folder)))

@@ -1,6 +1,6 @@
 """Draws the pictures of the book that commands make: python scripts/run.py make_book_pictures [FOLDER]
 
-The fields, the model in a photograph, and where two calibrations differ; docs/pictures by default.
+These are the fields, the model in a photograph, and the difference of two calibrations; default folder docs/pictures.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def run(*arguments: object) -> None:
 
 
 def draw(to: Path, folder: Path) -> None:
-    """See above; `folder` is for what is made on the way."""
+    """Draws all pictures; `folder` is for temporary files."""
     for name in FIELDS:
         run("targets", name, "--picture", to / f"field_{name}.svg", "--json")
     field, camera, new = folder / "field.json", folder / "camera.json", folder / "new.json"

@@ -1,6 +1,7 @@
-"""Makes the sample data sets anew: python scripts/run.py make_data [FOLDER]
+"""Makes the sample data sets again: python scripts/run.py make_data [FOLDER]
 
-Observations and truths are the same bytes every time, photographs as far as OpenCV's drawing and compression are.
+Observations and truths are the same bytes every time; photographs are, as far as OpenCV's drawing and compression
+allow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,10 +19,10 @@ from ceres_cal.simulate import Disturbance, Scene, Simulation, built_in_scene, s
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 SEED = 1
-DECIMALS = 4  # px; a hundredth of the least noise would already do, and every machine rounds to the same digits
+DECIMALS = 4  # of pixels: finer than the noise, and the same on every machine
 PHOTOGRAPHED = (*(f"{i:04d}" for i in range(1, 4)), *(f"board_{i:02d}" for i in range(1, 9)))
 BUMPED = overhead_pose(-2.255, -0.128, 4.012, tilt_x_deg=1.1, tilt_y_deg=-3.1, yaw_deg=91.0)
-"""Of a camera that someone has knocked: 19 mm and 1.1 degrees away from where it was."""
+"""Pose of the camera after somebody knocked it: it has moved by 19 mm and 1.1 degrees."""
 
 
 def rounded(simulation: Simulation) -> Simulation:
@@ -33,7 +34,7 @@ def rounded(simulation: Simulation) -> Simulation:
 
 
 def frames_only(scene: Scene, frames: tuple[str, ...]) -> Scene:
-    """The scene with these frames only."""
+    """The scene with only these frames."""
     kept = (replace(v, frames=tuple(frame for frame in v.frames if frame in frames)) for v in scene.views)
     return replace(scene, views=tuple(view for view in kept if view.frames))
 
@@ -57,11 +58,11 @@ def make_ssl_field(folder: Path) -> None:
 
 
 def make_ssl_field_moved(folder: Path) -> None:
-    """The same camera after it was knocked, in one frame."""
+    """One frame of the same camera after it was knocked."""
     scene, disturbance = built_in_scene("ssl-field")
     moved = replace(frames_only(scene, ("0001",)), stations={"overhead": Station("overhead", BUMPED)})
     moved = replace(moved, placements={}, targets={"field": moved.targets["field"]})
-    # Other robots than before, and other noise: another seed.
+    # Another seed gives other robots and other noise than before.
     album = take_album(simulate(moved, Disturbance(), SEED + 1), "jpg")
     write_images(album.images, folder)
     write_simulation(rounded(simulate(moved, disturbance, SEED + 1)), folder, {"photographs": album.truth})

@@ -1,10 +1,10 @@
 """Photographs by another model than the estimator's, calibrated and compared: python scripts/run.py make_honest_picture
 
 The camera has OpenCV's lens with decentring. The field is painted 12 mm longer and 9 mm narrower than drawn, its paint
-is worn, and the sun shines on it in stripes. The calibration knows none of this. Once it takes the field as drawn and
-the `radial` lens; once it solves for length and width and chooses the lens. A tape gave the camera's height to 20 mm.
+is worn, and the sun makes stripes on it. The calibration knows none of this. It is run once with the field as drawn and
+the `radial` lens, and once with unknown length and width and a chosen lens. The camera's height is stated to 20 mm.
 
-Writes docs/pictures/honest.jpg, the first photograph with the calibrated model on it. Prints how far off places are.
+Writes docs/pictures/honest.jpg, the first photograph with the calibrated model on it. Prints the errors of places.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def rendered(folder: Path) -> None:
 
 
 def calibrated(folder: Path, *how: str) -> Calibration:
-    """By the commands that somebody would type; `how`: for `detect field` and `calibrate`."""
+    """The calibration by the commands that a user would type; `how`: options of `detect field` and `calibrate`."""
     field, camera, photographs = folder / "field.json", folder / "camera.json", folder / "photographs"
     found = ["--target", "ssl-b", "--auto", "--facing", "LeftGoalLine=top", *[word for word in how if word != RADIAL]]
     steps = (
@@ -57,7 +57,7 @@ def calibrated(folder: Path, *how: str) -> Calibration:
 
 
 def errors_mm(calibration: Calibration, height_m: float) -> tuple[float, float, float]:
-    """Root mean square and largest error over the field that is seen, and the largest stated 95 % radius."""
+    """Root mean square and largest error over the visible field, and the largest stated 95 % radius."""
     known = calibration.uncertainty.map_sd_mm("camera", height_m)
     places = np.column_stack([known.places, np.full(len(known.places), height_m)])
     pixels = TRUE.at(POSE).project(places)

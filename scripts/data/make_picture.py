@@ -1,4 +1,4 @@
-"""Draws the README's picture: the sample field as its calibrated camera sees it, residuals enlarged, outliers marked.
+"""Draws the README's picture: the sample field seen by its calibrated camera, enlarged residuals, marked outliers.
 
 Run: python scripts/run.py make_picture [OUT.svg]
 """
@@ -18,7 +18,7 @@ from ceres_cal.scene.curves import curve_points
 
 ROOT = Path(__file__).parents[2]
 ENLARGED = 25.0
-PAINT, POINT, RESIDUAL, OUTLIER = "#9fb8a4", "#0072b2", "#0072b2", "#d55e00"  # apart for colour-blind readers too
+PAINT, POINT, RESIDUAL, OUTLIER = "#9fb8a4", "#0072b2", "#0072b2", "#d55e00"  # also for colour-blind readers
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -69,7 +69,7 @@ def marks(observations: Observations, calibration: Calibration) -> Iterator[str]
 
 
 def image_normals(observations: Observations, camera: Camera) -> Array:
-    """(M, 2) unit vectors in the image across the curve that each observation shows."""
+    """(M, 2) unit normals in the image of the curve at each observation."""
     field = observations.targets["field"]
     ground = np.column_stack([camera.locate(observations.curves.pixels), np.zeros(len(observations.curves))])
     is_arc = field.is_arc[observations.curves.feature]

@@ -1,4 +1,4 @@
-"""Draws the README's picture of the report: three places of the sample field's page, as Chromium shows them.
+"""Draws the README's picture of the report: three parts of the sample field's page, as Chromium shows them.
 
 Run: python scripts/run.py make_report_picture [OUT.png]
 """
@@ -19,18 +19,18 @@ from ceres_cal.report import make_report
 
 ROOT = Path(__file__).parents[2]
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-PLACES = ("", "#radius-0", "#maps")  # the top of the page, and pictures and sections by their names in it
-WIDTH_PX, HEIGHT_PX, GAP_PX = 1040, 1160, 28  # of each place, in the page's own pixels
-SMALLER = 0.5  # Chromium goes no lower
+PLACES = ("", "#radius-0", "#maps")  # anchors in the page; "" is its top
+WIDTH_PX, HEIGHT_PX, GAP_PX = 1040, 1160, 28  # of each part, in the page's own pixels
+SMALLER = 0.5  # the smallest scale that Chromium accepts
 
 
 def chromium() -> str | None:
-    """The program; None where there is none."""
+    """Path of the program; None where there is none."""
     return next((path for path in map(shutil.which, NAMES) if path), None)
 
 
 def beside_each_other(page: Path) -> str:
-    """A page that shows the places of another one."""
+    """A page that shows the parts of another one beside each other."""
     style = (
         f"body {{margin: 0; background: #cbd0d4; display: flex; gap: {GAP_PX}px; padding: {GAP_PX}px}}"
         f"iframe {{width: {WIDTH_PX}px; height: {HEIGHT_PX}px; border: 0; background: #fff; flex: none}}"

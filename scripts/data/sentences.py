@@ -1,7 +1,7 @@
-"""Every sentence that a user can meet, out of the source, in one table: python scripts/run.py sentences [WORD ...]
+"""All sentences of the source that a user may see, in one table: python scripts/run.py sentences [WORD ...]
 
-A line each: where it stands, what it is (error, help, answer, words), and the text, with {names} for what is filled in.
-With words: only texts that hold one of them. `rules` says what is wrong with a text (tests/test_sentences.py).
+One line each: file and line, kind (error, help, answer, words), and the text, with {names} for inserted values. With
+words: only texts that contain one of them. `rules` returns what is wrong with a text (tests/test_sentences.py).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _BANNED = (
     ),
     *("cannot be told", "cannot tell", "px aside", "mm aside", "lies aside", "nobody observed", "brought back"),
 )
-"""Idioms of ours that no reader knows; what to write instead is plain English."""
+"""Our own idioms that readers do not know; plain English must be used instead."""
 _UNITS = (
     *(
         "px",
@@ -59,7 +59,7 @@ _NUMBER = re.compile(r"\{[^{}]*:[+ ]?\.\d[fg]\}")
 
 
 class Sentence(NamedTuple):
-    """One text: file and line, what it is, and how it reads."""
+    """One text: file and line, kind, and the text itself."""
 
     where: str
     kind: str
@@ -67,7 +67,7 @@ class Sentence(NamedTuple):
 
 
 def sentences() -> list[Sentence]:
-    """All of them, by file."""
+    """All texts, by file."""
     return [one for path in sorted(SOURCE.rglob("*.py")) for one in _of_file(path)]
 
 
@@ -86,7 +86,7 @@ def _of_file(path: Path) -> Iterator[Sentence]:
 
 
 def _texts(node: ast.AST, kind: str) -> Iterator[tuple[int, str, str]]:
-    """Line, kind and text of every string below a node that is no docstring."""
+    """Line, kind and text of every string below a node, except docstrings."""
     if isinstance(node, ast.Constant | ast.JoinedStr):
         if not isinstance(node, ast.Constant) or isinstance(node.value, str):
             yield node.lineno, kind, _text(node)
@@ -122,7 +122,7 @@ def _placeholder(part: ast.FormattedValue) -> str:
 
 
 def _is_prose(text: str) -> bool:
-    """Whether it is a sentence or a part of one: not a pattern, a style or a command."""
+    """Whether the text is a sentence or a part of one, not a pattern, a style or a command."""
     words = re.findall(r"[a-z]{2,}", text)
     return len(words) >= _FEWEST_WORDS and not re.search(r"[\\^]|\(\?|</|\(\)|://|;base64", text)
 
@@ -131,7 +131,7 @@ def _is_prose(text: str) -> bool:
 
 
 def rules(text: str) -> list[str]:
-    """What of the simple rules of plain English a text does not keep."""
+    """Rules of plain English that a text breaks."""
     wrong = [f"banned: {idiom}" for idiom in _BANNED if re.search(rf"\b{re.escape(idiom)}\b", text)]
     for part in re.split(r"[.!?;](?:\s|$)|: (?=[a-z])", text):
         if (count := len(part.split())) > MOST_WORDS:

@@ -1,4 +1,4 @@
-"""Write the JSON schemas that the package ships, after a change of its files."""
+"""Write the JSON schemas that are part of the package, after a change of its files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FOLDER = Path(__file__).parents[2] / "src/ceres_cal/schemas"
 
 
 def file_schemas() -> dict[str, dict[str, Any]]:
-    """Name of the shipped file -> schema: of calibrations and of observations."""
+    """Name of the schema file -> schema, of calibrations and of observations."""
     kinds = {"calibration": CalibrationFile, "observations": ObservationsFile}
     schemas = {f"{name}.schema.json": msgspec.json.schema(kind) for name, kind in kinds.items()}
     plain: dict[str, dict[str, Any]] = _alike(msgspec.json.decode(msgspec.json.encode(schemas)))  # defaults are tuples
@@ -25,8 +25,8 @@ def file_schemas() -> dict[str, dict[str, Any]]:
 
 
 def _alike(part: Any) -> Any:
-    """A part of a schema as every msgspec has it: 0.23 takes the indentation out of docstrings, and names empty
-    defaults.
+    """A part of a schema, the same for every version of msgspec: 0.23 removes the indentation of docstrings, and writes
+    empty defaults.
     """
     if isinstance(part, list):
         return [_alike(one) for one in part]

@@ -1,1 +1,1 @@
-"""Damaged files, killed writers, full disks, a week of watching."""
+"""Damaged files, killed writers, full disks, and a week of watching."""

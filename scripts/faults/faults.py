@@ -1,7 +1,8 @@
 """Writers that are killed, and disks that are full: python scripts/run.py faults [--help]
 
-A process that saves one of two calibrations in turn is killed at a random moment, or may write so many bytes only.
-Counted: a file that is neither of the two, and what is left beside it after the next save. Exits with 1 when there is.
+A process that saves two calibrations in turns is killed at a random moment, or may write only so many bytes. Counted
+are files that are neither of the two, and files that are left beside it after the next save. Exits with 1 where there
+is one.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ while True:
 
 
 def fault(folder: Path, rng: random.Random, full: bool) -> None:
-    """Start the writer; end it in one way or the other."""
+    """Start the writer, and end it in one of the two ways."""
     largest = rng.randrange(0, 400_000)
 
     def limit() -> None:
@@ -52,7 +53,7 @@ def fault(folder: Path, rng: random.Random, full: bool) -> None:
 
 
 def bad_after(folder: Path, rng: random.Random, full: bool) -> tuple[int, int]:
-    """Whether the file is half, and how many are left beside it when it has been saved once more."""
+    """Whether the file is incomplete, and the number of files left beside it after one more save."""
     from ceres_cal.base.files import write_bytes
 
     whole = [(folder / name).read_bytes() for name in ("a.json", "b.json")]
@@ -64,7 +65,7 @@ def bad_after(folder: Path, rng: random.Random, full: bool) -> tuple[int, int]:
 
 
 def rows(what: str, full: bool, runs: int) -> Iterator[Row]:
-    """Of so many faults of a kind."""
+    """The figures of so many faults of one kind."""
     rng = random.Random(0)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,4 +1,4 @@
-"""What scripts/fuzz.py runs: a corpus of good files, commands over them, and how their words are changed."""
+"""Cases for scripts/fuzz.py: a corpus of good files, commands for them, and changes of their words."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ FORMATS: dict[str, Reader] = {
     "ceres-cal/observations": Observations.load,
     "ceres-cal/calibration": Calibration.load,
 }
-"""What our own commands write is what our readers take."""
+"""Our readers must accept what our own commands write."""
 OTHER_FILES = {
     "corners.vnl": b"# filename x y level\n" + b"".join(b"a.png %d 20 %d\n" % (10 * n, n % 2) for n in range(4)),
     "table.csv": b"frame,point,curve,x_px,y_px,sigma_px\n1,TopLeftCorner,,9,5,0.3\n1,,TopTouchLine,12,5,\n",
@@ -124,7 +124,7 @@ def _custom() -> dict[str, Any]:
 
 
 def _few_boards() -> dict[str, Any]:
-    """Of the sample the field and four boards."""
+    """The field and four boards of the sample."""
     data: dict[str, Any] = json.loads((DATA / "ssl_field" / "observations.json").read_text())
     views = data["views"]
     boards = [view for view in views if view["target"] != "field"][:4]
@@ -135,7 +135,7 @@ def _few_boards() -> dict[str, Any]:
 
 
 def corpus(folder: Path) -> None:
-    """One good file for each reader, and what commands take besides."""
+    """One good file for each reader, and the other inputs of commands."""
     observations = Observations.load(DATA / "ssl_field_moved" / "observations.json")
     for ending in (".json", ".npz", ".columns"):
         observations.save(folder / f"observations{ending}")
@@ -144,7 +144,7 @@ def corpus(folder: Path) -> None:
     x, y = np.array([-4.5, 4.5]), np.array([-3.0, 3.0])
     station = next(iter(calibration.stations))
     make_lookup_table(calibration.stations[station], station, x, y, step_px=128).save(folder / "table.npz")
-    exact = calibrate(observations, Options(lens="brown"))  # in OpenCV's words: nothing has to be fitted to it
+    exact = calibrate(observations, Options(lens="brown"))  # OpenCV has the same lens, so that exports are exact
     for name, form in EXPORTED.items():
         of_league = "geometry" in name or form == "paper"
         options: dict[str, Any] = {"camera_id": "0"} if "geometry" in name else {}
@@ -208,7 +208,7 @@ def _foreign_observations(folder: Path) -> None:
 
 
 def round_trip(loaded: object, path: Path) -> bool:
-    """Whether what was accepted comes back from a file of its own, to the last byte."""
+    """Whether an accepted object is the same, to the last byte, after it is saved and loaded again."""
     if not isinstance(loaded, Observations | Calibration | LookupTable):
         return True
     ending = ".npz" if path.suffix == ".npz" else ".json"
@@ -222,13 +222,13 @@ def round_trip(loaded: object, path: Path) -> bool:
 
 
 def read(words: list[str]) -> int:
-    """A reader that may have no command, from Python: `read KIND FILE`; what it refuses begins with the file's name."""
+    """A reader without a command, called from Python: `read KIND FILE`; a refusal must begin with the file's name."""
     path = Path(words[1])
     try:
         loaded = READERS[words[0]](path)
     except CalibrationError as error:
-        # A model of several files goes by its folder, or by the file of it that is wrong.
-        named, folder = (" ".join(printable(str(one)).split()) for one in (path, path.parent))  # as one line has it
+        # For a model of several files the message names its folder, or the wrong file.
+        named, folder = (" ".join(printable(str(one)).split()) for one in (path, path.parent))  # as in messages
         if not str(error).startswith((named, f"{folder}:", f"{folder}/")):
             raise AssertionError(f"a refusal that does not name its file: {error}") from None
         raise
@@ -238,14 +238,14 @@ def read(words: list[str]) -> int:
 
 
 def options_of_python(words: list[str]) -> int:
-    """`options NAME=JSON ...`: options that somebody gives in Python, of whatever type."""
+    """`options NAME=JSON ...`: options given in Python, of any type."""
     given = dict(word.split("=", 1) for word in words)
     Options(**{name: json.loads(value) for name, value in given.items()})
     return 0
 
 
 def target_of_python(words: list[str]) -> int:
-    """`target JSON`: a target that somebody spells out."""
+    """`target JSON`: a target given in Python."""
     for word in words:
         target_from_spec(json.loads(word), "a target")
         targets_from_specs({"field": json.loads(word)})
@@ -325,7 +325,7 @@ COMMAND_LINES: tuple[tuple[float, str], ...] = (
     ),
     (0.05, "run photograph.jpg --target field.json --facing LeftGoalLine=left -o out --to opencv --lens radial"),
 )
-"""How often, and what; what stands behind ;; is never changed (a command that would go on for ever ends by it)."""
+"""Weight and command line; the part after ;; is never changed, so that commands without an end stop."""
 PLAUSIBLE: dict[str, tuple[str, ...]] = {
     "--prior": ("height_m=4.02:0.02", "phi=812:5", "position_m=0,0,4:1,1,0.1", "k1=0:1e-3", "aspect=1:0.01"),
     "--tolerance": ("field.lines_m=0.01", "field.points_m=0.005", "board.warp_m=0.002"),
@@ -334,7 +334,7 @@ PLAUSIBLE: dict[str, tuple[str, ...]] = {
     "--powers": ("2,3", "3", "3,5", "2,3,4,5"),
     "--lens": ("auto", "radial", "brown", "kannala-brandt", "?"),  # a spline takes seconds
     "--terms": ("rational", "prism", "tangential", "surface"),
-    "--jobs": ("1", "-1"),  # processes of their own are another tool's (scripts/faults/week.py)
+    "--jobs": ("1", "-1"),  # other processes are tested by scripts/faults/week.py
     "--scheduler": ("tcp://127.0.0.1:1", "x"),
     "--same-frame": ("index", "within:0.01", "left*,right*", "*"),
     "--corner": ("TopLeftCorner=102,88", "CenterMark=10,10"),
@@ -359,7 +359,7 @@ PLAUSIBLE: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """One command: its words, of which some are files in the folder where it is run; how, is said beside."""
+    """One command: its words, some of which are files in the folder where it runs; and the changes that were made."""
 
     program: str
     words: tuple[str, ...]
@@ -371,7 +371,7 @@ class Case:
         return next((name for name in known if name in COMMANDS), self.program)
 
     def run(self) -> int:
-        """Its exit code; what Python raises is what it is called to find."""
+        """Its exit code; exceptions are not caught, since they are what is looked for."""
         if not self.program:
             return cli(list(self.words))
         return PROGRAMS[self.program](list(self.words))
@@ -413,7 +413,7 @@ def _copy(source: Path, place: Path) -> None:
     if source.is_dir():
         shutil.copytree(source, place)
         return
-    if source.parent.name == "colmap":  # the others of a model are whole
+    if source.parent.name == "colmap":  # the other files of a model stay unchanged
         shutil.copytree(source.parent, place.parent, dirs_exist_ok=True)
     shutil.copyfile(source, place)
 
@@ -423,7 +423,7 @@ def _files_in(place: Path) -> list[Path]:
 
 
 def content_changed(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
-    """The content of one of the files."""
+    """Changes the content of one of the files."""
     if files := _files_in(place):
         path = one_of(files, rng)
         name = str(path.relative_to(place))
@@ -433,7 +433,7 @@ def content_changed(words: list[str], good: Path, place: Path, rng: Rng) -> list
 
 
 def file_exchanged(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
-    """Another file stands under the name of one."""
+    """Replaces one file by another."""
     names = sorted(str(path.relative_to(good)) for path in _files_in(good))
     if files := _files_in(place):
         shutil.copyfile(good / one_of(names, rng), one_of(files, rng))
@@ -441,7 +441,7 @@ def file_exchanged(words: list[str], good: Path, place: Path, rng: Rng) -> list[
 
 
 def file_odd(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
-    """Something that is no file, or none of ours, stands in the place of a file; or its name is an odd one."""
+    """Replaces a file by something that is no file or no file of ours, or gives it an odd name."""
     files = _files_in(place)
     if not files:
         return words
@@ -467,11 +467,11 @@ def file_odd(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
             stream.truncate(10**10)
     elif kind == 5:
         path.symlink_to(one_of(["/dev/zero", "/dev/null", "/dev/full", "/proc/self/mem", place], rng))
-    return words  # or it is not there
+    return words  # for other kinds the file is missing
 
 
 def word_odd(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
-    """One of the words but the command's name, changed or exchanged."""
+    """Changes or replaces one of the words after the command's name."""
     first = _first(words)
     at = int(rng.integers(first, max(len(words), first + 1)))
     if at < len(words):
@@ -480,7 +480,7 @@ def word_odd(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
 
 
 def words_odd(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
-    """A word left out, doubled, or exchanged with another."""
+    """Removes or repeats a word, or exchanges two."""
     first = _first(words)
     if len(words) <= first:
         return words
@@ -494,7 +494,7 @@ def words_odd(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
 
 
 def option_added(words: list[str], good: Path, place: Path, rng: Rng) -> list[str]:
-    """An option that the command has, with a plausible value or an odd one."""
+    """Adds an option of the command, with a plausible value or an odd one."""
     options = _options(" ".join(words[: _first(words)]))
     if not options:
         return words
@@ -521,7 +521,7 @@ def _options(command: str) -> dict[str, argparse.Action]:
 
 
 def _first(words: list[str]) -> int:
-    """How many words are the command's name; of a reader its kind."""
+    """Number of words of the command's name; for a reader, one: its kind."""
     return 2 if " ".join(words[:2]) in COMMANDS else 1
 
 

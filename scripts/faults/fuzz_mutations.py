@@ -24,7 +24,7 @@ NUMBERS = (0, -1, 1, 2, 0.5, -0.0, 1e7, 1e-12, 1e-300, 1e308, 2**31, 2**63, 10**
 TEXTS = ("", " ", "a", "x" * 300, "é\n\u2028", "../../etc/passwd", "-1", "nan", "a/b", "a.b", "*", "\x00", "\x1b[31m")
 OTHERS: tuple[Any, ...] = (None, True, False, [], {}, [[]], [1, 2, 3], {"a": 1}, [None], [[1, 2], [3]])
 SIZES = ((1, 1), (1, 2), (2, 1), (3, 3), (8, 8), (1, 60000), (60000, 1), (2, 5000), (5000, 3), (64, 48), (400, 300))
-_LARGE = 2_000_000  # bytes: what grows faster than its size takes long then
+_LARGE = 2_000_000  # bytes, so that code slower than linear takes long
 _JSON = (".json", ".columns/header.json")
 _TEXT = (".yml", ".yaml", ".xml", ".cameramodel", ".txt", ".vnl", ".csv", ".toml", ".jsonl")
 IMAGES = (".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm", ".ppm", ".jp2")
@@ -35,12 +35,12 @@ def one_of(choices: Sequence[Any], rng: Rng) -> Any:
 
 
 def mutated(name: str, content: bytes, rng: Rng) -> bytes:
-    """The content of a file of this name, with one to three changes of a kind that knows what it is."""
+    """The content of a file of this name, with one to three changes of a kind suitable for its format."""
     kinds = next((kinds for endings, kinds in _KINDS if name.endswith(endings)), (bytes_changed,))
     kind = bytes_changed if rng.random() < 0.15 else one_of(kinds, rng)
     try:
         return bytes(kind(content, rng))
-    except (ValueError, zipfile.BadZipFile):  # a change came before, after which it is no such file any more
+    except (ValueError, zipfile.BadZipFile):  # an earlier change has damaged its format
         return bytes_changed(content, rng)
 
 
@@ -71,7 +71,7 @@ def bytes_changed(content: bytes, rng: Rng) -> bytes:
 
 
 def words_changed(content: bytes, rng: Rng) -> bytes:
-    """Text with some of its words exchanged, doubled, left out or replaced by odd ones."""
+    """Text with some of its words exchanged, repeated, removed or replaced by odd ones."""
     places = [match.span() for match in WORD.finditer(content)]
     for _ in range(int(rng.integers(1, 4)) if places else 0):
         first, last = one_of(places, rng)
@@ -85,7 +85,7 @@ def words_changed(content: bytes, rng: Rng) -> bytes:
 
 
 def lines_changed(content: bytes, rng: Rng) -> bytes:
-    """Text with a line left out, doubled, exchanged with another one, or said so often that it is large."""
+    """Text with a line removed, repeated, exchanged with another one, or repeated until the text is large."""
     lines = content.splitlines(keepends=True) or [b""]
     a, b = (int(rng.integers(0, len(lines))) for _ in range(2))
     kind = rng.integers(0, 6)
@@ -106,7 +106,7 @@ def lines_changed(content: bytes, rng: Rng) -> bytes:
 
 
 def long_number(content: bytes, rng: Rng) -> bytes:
-    """Text in which one number is as long as a book: in base 10, or 60 as old YAML has it."""
+    """Text with one very long number, in base 10, or in base 60 as in old YAML."""
     places = [match.span() for match in NUMBER.finditer(content)]
     if not places:
         return content
@@ -119,7 +119,7 @@ def long_number(content: bytes, rng: Rng) -> bytes:
 
 
 def tree_changed(content: bytes, rng: Rng) -> bytes:
-    """JSON with one to three of its values and names changed; whatever it is, it is JSON as Python spells it."""
+    """JSON with one to three of its values and names changed; the result is JSON as Python writes it."""
     tree: list[Any] = [json.loads(content)]
     for _ in range(int(rng.integers(1, 4))):
         parent, key = _place(tree, rng)
@@ -131,7 +131,7 @@ def tree_changed(content: bytes, rng: Rng) -> bytes:
 
 
 def _place(tree: list[Any], rng: Rng) -> tuple[Any, Any]:
-    """Somewhere in a tree: each level is as likely, however many values it has."""
+    """A random place in a tree; each level has the same probability, for any number of values."""
     parent: Any = tree
     key: Any = 0
     while True:
@@ -155,7 +155,7 @@ def _names_changed(owner: dict[str, Any], key: str, rng: Rng) -> None:
 
 
 def value_changed(value: Any, rng: Rng) -> Any:
-    """Another value: of its own kind mostly."""
+    """Another value, in most cases of the same type."""
     if rng.random() < 0.06:
         return one_of([*OTHERS, *NUMBERS, *TEXTS], rng)
     if isinstance(value, bool) or value is None:
@@ -201,7 +201,7 @@ def _list_changed(values: list[Any], rng: Rng) -> Any:
 
 
 def columns_changed(content: bytes, rng: Rng) -> bytes:
-    """An archive whose columns are other ones: bytes, headers, numbers; its own checks agree with them."""
+    """An archive with other columns: bytes, headers, numbers; its check sums are correct."""
     stream = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
         names = old.namelist()
@@ -213,7 +213,7 @@ def columns_changed(content: bytes, rng: Rng) -> bytes:
 
 
 def column_changed(column: bytes, rng: Rng) -> bytes:
-    """A .npy file of other numbers, of another type, order or shape, or damaged."""
+    """A .npy file with other numbers, type, order or shape, or a damaged one."""
     kind = rng.integers(0, 5)
     if kind == 0:
         return bytes_changed(column, rng)
@@ -246,7 +246,7 @@ def array_changed(array: Any, rng: Rng) -> Any:
     ]
     try:
         return one_of(changes, rng)(array)
-    except (TypeError, ValueError, IndexError, OverflowError):  # text has no sum, and a single number no order
+    except (TypeError, ValueError, IndexError, OverflowError):  # not every change applies to text or to a single number
         return array[..., None]
 
 
@@ -261,7 +261,7 @@ def header_changed(column: bytes, rng: Rng) -> bytes:
 
 
 def image_changed(content: bytes, rng: Rng) -> bytes:
-    """A picture of another size, or of nothing, of noise, of other depths."""
+    """A picture of another size, empty, of noise, or of another depth."""
     image: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     size, level = one_of(SIZES, rng), int(one_of([0, 1, 128, 255], rng))
     changes: list[Callable[[Any], Any]] = [
@@ -288,7 +288,7 @@ def image_changed(content: bytes, rng: Rng) -> bytes:
 
 
 def word_changed(word: str, rng: Rng) -> str:
-    """A word of a command line, such as 4.02:0.01, a,b or 9x6x100, with a number or letter changed, or another one."""
+    """A word of a command line, such as 4.02:0.01, a,b or 9x6x100, with a changed number or letter, or another word."""
     if word.startswith("{") and rng.random() < 0.8:
         return tree_changed(word.encode(), rng).decode()
     spans = [match.span() for match in re.finditer(r"-?[0-9]+(\.[0-9]+)?", word)]

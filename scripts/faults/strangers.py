@@ -1,8 +1,8 @@
-"""Every command over photographs that nobody here made, as a stranger types them: python scripts/run.py strangers
+"""Every command for photographs from elsewhere, as a new user types them: python scripts/run.py strangers
 
-Each picture goes through `run` with its target alone, and what that wrote through the commands that take it, and
-through files of all formats and back. Counted: words that are not meant for people (an unexpected error, nan, inf).
-Exits with 1 when there are any; the folders are ../photos and ../photos3 beside $CERES_CAL_REAL.
+Each picture is given to `run` with only its target. The result is given to all commands that accept it, and is exported
+to all formats and imported again. Counted are lines not meant for users (an unexpected error, nan, inf). Exits with 1
+where there are any; the folders are ../photos and ../photos3 beside $CERES_CAL_REAL.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ODD = re.compile(r"unexpected|Traceback|[a-z]Warning|\bnan\b|\binf\b|\bNaN\b")
 
 
 def odd_words(*arguments: object) -> list[str]:
-    """What a command says that is not meant for people."""
+    """Lines of a command's output that are not meant for users."""
     ran = subprocess.run([*PROGRAM, *map(str, arguments)], capture_output=True, text=True, timeout=600)
     said = [line for line in (ran.stdout + ran.stderr).splitlines() if _ODD.search(line)]
     said += [] if ran.returncode in (0, 1, 2, 3) else [f"exit code {ran.returncode}"]
@@ -35,7 +35,7 @@ def odd_words(*arguments: object) -> list[str]:
 
 
 def commands(folder: Path, picture: Path) -> Iterator[tuple[object, ...]]:
-    """Those that take what `run` made of a picture."""
+    """The commands that accept the result of `run` for a picture."""
     made, seen = folder / "calibration.json", folder / "field.json"
     yield from ((name, made, seen) for name in ("diagnose", "check", "score"))
     yield from (("audit", made, "--observations", seen), ("refit", made, seen, "-o", folder / "new.json"))
@@ -51,7 +51,7 @@ def commands(folder: Path, picture: Path) -> Iterator[tuple[object, ...]]:
 
 
 def rows(folder: str, runs: int) -> Iterator[Row]:
-    """Of the first so many pictures of a folder."""
+    """The figure for the first so many pictures of a folder."""
     truths = sorted((real_folder().parent / folder).glob("*.truth.json"))[:runs]
     said: list[str] = []
     with tempfile.TemporaryDirectory() as place:

@@ -1,9 +1,9 @@
-"""A week of watching in fast motion: python scripts/run.py week [--help]
+"""A week of watching, accelerated: python scripts/run.py week [--help]
 
-`refit_after_move.py --watch` runs as its users run it. Files of observations appear in its folder, one in ten of them
-damaged or cut; every thousand files the camera has moved; now and then the folder is renamed for a while, or no file
-can grow any more, as on a full disk. Handled files are cleared away. "yes": the figure keeps to what is promised; "no":
-missed. Exits with 1 when a figure is missed.
+`refit_after_move.py --watch` runs as users run it. Files of observations appear in its folder, one in ten of them
+damaged or truncated. After every thousand files the camera has moved. Sometimes the folder is renamed for a while, or
+no file can grow, as on a full disk. Processed files are removed. "yes": the limit is kept. "no": it is missed. Exits
+with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ceres_cal.moves.checks import check
 
 SCRIPT = Path(__file__).parents[1] / "refit_after_move.py"
 PLACES = {"home": HOME, "moved": MOVED}
-KINDS = 20  # files of each place, drawn from again and again
+KINDS = 20  # files of each place, from which all files are drawn
 HEAP = 50  # files that appear at once
 MOVE_EVERY, AWAY_EVERY, FULL_EVERY = 1000, 1700, 2300
 DAMAGED = 0.1
@@ -39,8 +39,8 @@ FLAT = 1.05  # times the memory of the first tenth
 
 
 @dataclass(frozen=True)
-class Dropped:
-    """A file that appeared: its name, whether it can be read, and where the camera then stood."""
+class DroppedFile:
+    """A file that appeared: its name, whether it can be read, and the place of the camera at that time."""
 
     name: str
     good: bool
@@ -58,12 +58,12 @@ class Watch:
         calibrated(0).save(self.calibration)
         arguments = [str(self.calibration), "--watch", str(self.incoming), "--log", str(self.log), "--every-s", "0.05"]
         self._process = subprocess.Popen([sys.executable, str(SCRIPT), *arguments], cwd=folder)
-        time.sleep(3.0)  # what lies there when the watch begins is not new
+        time.sleep(3.0)  # files that exist when the watch begins are not new
         self._read = 0
         self.events: list[dict[str, object]] = []
 
     def drop(self, name: str, content: bytes) -> None:
-        """A file appears, whole; also while the folder is away."""
+        """A complete file appears, even while the folder is renamed."""
         (self._staging / name).write_bytes(content)
         folder = self.incoming if self.incoming.exists() else self._away
         (self._staging / name).rename(folder / name)
@@ -73,12 +73,12 @@ class Watch:
         one.rename(other)
 
     def full(self, *, full: bool) -> None:
-        """No file of the process grows any more, or they may again."""
+        """Prevents all files of the process from growing, or allows it again."""
         limit = 0 if full else resource.RLIM_INFINITY
         resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
 
     def wait_for(self, names: Sequence[str]) -> set[str]:
-        """Wait until the log has all of these files; what is missing at the end."""
+        """Wait until the log has all of these files; returns those that are missing at the end."""
         end, missing = time.monotonic() + LONGEST_S, set(names)
         while missing and time.monotonic() < end:
             for event in self._new_events():
@@ -100,7 +100,7 @@ class Watch:
         for line in Path(f"/proc/{self._process.pid}/status").read_text().splitlines():
             if line.startswith("VmRSS"):
                 return float(line.split()[1]) / 1024.0
-        return float("nan")  # it has ended
+        return float("nan")  # the process has ended
 
     def end(self) -> int:
         self._process.send_signal(signal.SIGTERM)
@@ -108,13 +108,13 @@ class Watch:
 
 
 def damaged(content: bytes, rng: np.random.Generator) -> bytes:
-    """What no reader can take for observations: cut short, or with bytes that are no text."""
+    """Content that no reader accepts as observations: truncated, or with bytes that are no text."""
     at = int(rng.integers(0, len(content) // 2))
     return content[:at] if rng.random() < 0.5 else content[:at] + b"\xff\x00{" + content[at + 9 :]
 
 
 def contents(folder: Path) -> dict[str, list[bytes]]:
-    """Files of observations of each place of the camera."""
+    """Files of observations for each place of the camera."""
     files: dict[str, list[bytes]] = {}
     for place, pose in PLACES.items():
         files[place] = []
@@ -125,14 +125,14 @@ def contents(folder: Path) -> dict[str, list[bytes]]:
 
 
 def week(folder: Path, files: int) -> Iterator[tuple[str, float, float]]:
-    """Each figure with the most that it may be."""
+    """Each figure with its upper limit."""
     rng, given = np.random.default_rng(1), contents(folder)
     watch = Watch(folder)
-    dropped: list[Dropped] = []
+    dropped: list[DroppedFile] = []
     memory, lost, places, full = [], set(), list(PLACES), False
     for first in range(0, files, HEAP):
         place = places[first // MOVE_EVERY % len(places)]
-        heap = [Dropped(f"{first + n:07d}.json", bool(rng.random() >= DAMAGED), place) for n in range(HEAP)]
+        heap = [DroppedFile(f"{first + n:07d}.json", bool(rng.random() >= DAMAGED), place) for n in range(HEAP)]
         away, full = passes(first, AWAY_EVERY), passes(first, FULL_EVERY)
         if away:
             watch.rename(away=True)
@@ -162,12 +162,12 @@ def week(folder: Path, files: int) -> Iterator[tuple[str, float, float]]:
 
 
 def passes(first: int, every: int) -> bool:
-    """Whether a heap is one at which something happens every so many files."""
+    """Whether this heap contains a multiple of `every`."""
     return first > 0 and first // every != (first - HEAP) // every
 
 
-def figures(watch: Watch, dropped: Sequence[Dropped]) -> Iterator[tuple[str, float, float]]:
-    """What the log says of the files."""
+def figures(watch: Watch, dropped: Sequence[DroppedFile]) -> Iterator[tuple[str, float, float]]:
+    """Figures of the files from the log."""
     of_files = [event for event in watch.events if "file" in event]
     times = Counter(Path(str(event["file"])).name for event in of_files)
     kinds = {Path(str(event["file"])).name: str(event["event"]) for event in of_files}
@@ -182,7 +182,7 @@ def figures(watch: Watch, dropped: Sequence[Dropped]) -> Iterator[tuple[str, flo
 
 
 def rows(runs: int) -> Iterator[Row]:
-    """Of so many files."""
+    """The figures for so many files."""
     with tempfile.TemporaryDirectory() as folder:
         for what, value, most in week(Path(folder), runs):
             yield Row("week", what, float(value), most=most)

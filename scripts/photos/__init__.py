@@ -1,1 +1,1 @@
-"""The same from photographs, rendered and real."""
+"""Measurements on photographs, rendered and real."""

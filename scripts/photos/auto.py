@@ -1,4 +1,4 @@
-"""How often a field is found in a photograph without any start: `python scripts/photographs.py --case auto`."""
+"""How often a field is found in a photograph without an initial camera: `scripts/photographs.py --case auto`."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ WIDE = (
     (548.0, KannalaBrandt((-0.012, 0.004, -0.003, 0.0006))),
     (620.0, Radial((-8.0e-4, 2.232e-6), (2, 3))),
 )
-RIGHT_PX, RIGHT_SHARE = 2.0, 0.99  # of the line centres, from the curve whose name they bear
+RIGHT_PX, RIGHT_SHARE = 2.0, 0.99  # distance of the line centres from their curve, and share of them
 COMMAND = "import sys; from ceres_cal.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 def whole(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
-    """x, y, height (m), tilt and yaw (degrees) of a camera that sees the whole field, or nearly."""
+    """x, y, height (m), tilt and yaw (degrees) of a camera that sees the whole field, or nearly all of it."""
     yaw = float(rng.choice([0.0, 180.0]) + rng.uniform(-12.0, 12.0))
     return (*rng.normal(0.0, 0.3, 2), rng.uniform(6.5, 8.0), rng.uniform(0.0, 12.0), yaw)
 
 
 def half(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
-    """Any half of the field, turned anyhow."""
+    """Either half of the field, with any yaw."""
     return (
         float(rng.choice([-2.2, 2.2]) + rng.normal(0.0, 0.2)),
         float(rng.normal(0.0, 0.2)),
@@ -61,12 +61,12 @@ def quarter(rng: np.random.Generator) -> tuple[float, float, float, float, float
 
 
 def tilted(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
-    """Tilted by 20 to 45 degrees; x and y are where it looks, not where it hangs."""
+    """Tilted by 20 to 45 degrees; x and y are the place it looks at, not its position."""
     return (*rng.uniform((-1.5, -0.3), (1.5, 0.3)), rng.uniform(3.5, 5.0), rng.uniform(20.0, 45.0), rng.uniform(0, 360))
 
 
 def near(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
-    """So near that often too little is seen to tell where: what is found must be right nevertheless."""
+    """So near that the picture often does not determine the place; a result must be right nevertheless."""
     return (*rng.uniform((-4.2, -2.7), (4.2, 2.7)), rng.uniform(1.2, 2.8), rng.uniform(0.0, 25.0), rng.uniform(0, 360))
 
 
@@ -74,7 +74,7 @@ VIEWS = {"whole": whole, "half": half, "quarter": quarter, "tilted 20 to 45 degr
 
 
 def take_view(name: str, view: Callable[[np.random.Generator], tuple[float, ...]], seed: int) -> Shot:
-    """Photograph number `seed` of a kind of view, in the light and wear of `varied`."""
+    """Photograph number `seed` of a kind of view, with the light and wear of `varied`."""
     rng = np.random.default_rng([11, seed, len(name)])
     phi, lens = WIDE[seed % len(WIDE)] if name.startswith("wide") else LENSES[seed // 2 % len(LENSES)]
     optics = Camera((1280, 960), phi, (640.0 + rng.normal(0.0, 8.0), 480.0 + rng.normal(0.0, 8.0)), lens)
@@ -94,7 +94,7 @@ def take_view(name: str, view: Callable[[np.random.Generator], tuple[float, ...]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one photograph: "right", "wrong", "miss" or "several ways"; seconds; and why."""
+    """Result for one photograph: "right", "wrong", "miss" or "several ways"; seconds; and the reason."""
 
     what: str
     seconds: float
@@ -102,7 +102,7 @@ class Outcome:
 
 
 def outcome(shot: Shot, auto: Auto, other: Target | None = None) -> Outcome:
-    """Search one photograph for its field, or for another one: then whatever is found is wrong."""
+    """Search one photograph for its field, or for another one, for which any result is wrong."""
     target, grey = other or shot.target, shot.grey
     began = time.perf_counter()
     try:
@@ -119,7 +119,7 @@ def outcome(shot: Shot, auto: Auto, other: Target | None = None) -> Outcome:
 
 
 def rows_for(case: str, outcomes: Sequence[Outcome], least: float = -np.inf) -> Iterator[Row]:
-    """Shares of what came of these photographs."""
+    """Shares of the results of these photographs."""
     count, missed = len(outcomes), [one for one in outcomes if one.what in ("miss", "several ways")]
     found = sum(one.what == "right" for one in outcomes) / count
     note = f"{count} photographs, {len(missed)} misses that say so"
@@ -130,7 +130,7 @@ def rows_for(case: str, outcomes: Sequence[Outcome], least: float = -np.inf) -> 
 
 
 def searched(shots: Iterator[Shot]) -> list[Outcome]:
-    """Outcomes where an old calibration, turned by up to 60 degrees since, settles which way round."""
+    """Outcomes where an older calibration, rotated by up to 60 degrees, resolves the field's symmetry."""
     every = []
     for number, shot in enumerate(shots):
         turn = np.random.default_rng([17, number]).uniform(-60.0, 60.0)
@@ -142,7 +142,7 @@ def searched(shots: Iterator[Shot]) -> list[Outcome]:
 
 
 def auto_rows(runs: int) -> Iterator[Row]:
-    """The 200 photographs, other views of the field, another field, and no word on which way round."""
+    """The photographs of `take`, other views of the field, another field, and photographs without `--facing`."""
     album = [outcome(take(seed), FACING) for seed in range(runs)]
     yield from rows_for("auto", album, 0.95)
     seconds = [one.seconds for one in album]
@@ -162,7 +162,7 @@ def auto_rows(runs: int) -> Iterator[Row]:
 
 
 def process_seconds(runs: int) -> float:
-    """Median of `ceres-cal detect field --auto`, from nothing to the file."""
+    """Median time of `ceres-cal detect field --auto` as a whole process."""
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(runs):
@@ -177,7 +177,7 @@ def process_seconds(runs: int) -> float:
 
 
 def real_auto_rows(folder: Path) -> Iterator[Row]:
-    """The real photograph, without its clicks."""
+    """The real photograph, without clicks."""
     grey = read_light(folder / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png")
     target = real_target()
     painted = [name for name in target.curve_names if name not in NOT_PAINTED]

@@ -1,7 +1,6 @@
-"""Fields whose dimensions are not known, from observations and photographs: python scripts/run.py dimensions [--help]
+"""Fields with unknown dimensions, from observations and photographs: python scripts/run.py dimensions [--help]
 
-How often the truth lies in the 95 % intervals, and how far off the dimensions come out. Exits with 1 when a figure is
-missed.
+Printed are the coverage of the 95 % intervals and the errors of the dimensions. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -39,19 +38,19 @@ FIELD = ssl_field("B")
 
 
 def odd_field(names: tuple[str, ...], rng: np.random.Generator, most: float) -> dict[str, float]:
-    """Dimensions of a field that is by up to so much another one in those."""
+    """Random dimensions that differ by up to the share `most` from the field's."""
     return {name: FIELD.dimensions[name] * float(rng.uniform(1.0 - most, 1.0 + most)) for name in names}
 
 
 def scene_of(true: Mapping[str, float], rng: np.random.Generator) -> Scene:
-    """A whole field of these dimensions under one camera, tilted by up to 12 degrees."""
+    """A whole field of these dimensions below one camera, tilted by up to 12 degrees."""
     x, y, tilt_x, tilt_y = rng.uniform((-0.5, -0.3, -12.0, -12.0), (0.5, 0.3, 12.0, 12.0))
     pose = overhead_pose(x, y, 5.0, tilt_x, tilt_y, rng.uniform(-10.0, 10.0))
     return field_scene(ssl_field("B", **true), {"a": CAMERA}, {"s": Station("a", pose)}, spacing_m=0.15)
 
 
 def simulated(seed: int, names: tuple[str, ...], folder: Path) -> tuple[dict[str, float], Calibration]:
-    """Truth, and what comes of observations of a field that is said to be division B's."""
+    """The truth, and the calibration of observations for which the field is given as division B's."""
     rng = np.random.default_rng([11, seed])
     true = odd_field(names, rng, 0.15)
     seen = simulate(scene_of(true, rng), Disturbance(0.2, 0.2), seed).observations
@@ -60,7 +59,7 @@ def simulated(seed: int, names: tuple[str, ...], folder: Path) -> tuple[dict[str
 
 
 def photographed(seed: int, names: tuple[str, ...], folder: Path) -> tuple[dict[str, float], Calibration]:
-    """The same through a rendered photograph, in which the field is found without a start."""
+    """The same with a rendered photograph in which the field is found without an initial camera."""
     rng = np.random.default_rng([12, seed])
     true = odd_field(names, rng, 0.08)
     scene = taken_as(scene_of(true, rng), Photography(robots=4, unevenness=0.15, carpet_texture=0.05))
@@ -78,7 +77,7 @@ _Solve = Callable[[int, tuple[str, ...], Path], tuple[dict[str, float], Calibrat
 def _solved(
     solve: _Solve, names: tuple[str, ...], folder: Path, seed: int
 ) -> tuple[dict[str, float], Calibration] | str:
-    """What it comes to, or why to nothing."""
+    """The truth and the calibration, or the message of a refusal."""
     try:
         return solve(seed, names, folder)
     except CalibrationError as error:
@@ -86,7 +85,7 @@ def _solved(
 
 
 def rows(case: str, solve: _Solve, names: tuple[str, ...], runs: int) -> Iterator[Row]:
-    """Coverage and errors, of all dimensions together."""
+    """Coverage and errors of all dimensions together."""
     inside, errors, squares, failed = [], [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for seed, came in enumerate(over(partial(_solved, solve, names, Path(folder)), range(runs))):

@@ -1,5 +1,5 @@
-"""Small photographs with what stands, lies and shines on other people's floors, and of other fields than those asked
-for: `python scripts/photographs.py --case disturbed --case wrong --runs N`.
+"""Small photographs of disturbed floors, and of other fields than asked for: `python scripts/photographs.py --case
+disturbed --case wrong --runs N`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ LENSES: dict[str, tuple[float, Lens]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
+class DisturbedShot:
     """A photograph, the camera that took it, and the field that is painted in it."""
 
     camera: Camera
@@ -60,23 +60,24 @@ class Taken:
 
 
 def drawn_out() -> tuple[Array, Array]:
-    """Shifts (N,), as complex shares of 1 along the radius and across it, and weights (N,), of light that is drawn out
-    away from the middle of a lens, ever less of it the farther: lateral colour, and what coma is often taken for.
+    """Point spread of lateral colour, or of a simple coma: light spread outwards, with less light farther out.
+
+    Returns shifts (N,), complex, as shares of 1 along the radius and across it, and weights (N,).
     """
     share = np.linspace(0.0, 1.0, 13)
     return share.astype(complex), 1.0 - share
 
 
 def comatic() -> tuple[Array, Array]:
-    """The same of coma as it is: zones of the pupil make circles, ever larger and farther out, 60 degrees wide."""
+    """Point spread of real coma: zones of the pupil make circles, larger and farther out, in a wedge of 60 degrees."""
     zone, turn = (one.ravel() for one in np.meshgrid((np.arange(4) + 0.5) / 4.0, np.arange(9) * 2.0 * np.pi / 9.0))
     return zone * (2.0 + np.exp(1j * turn)) / 3.0, np.ones(len(zone))
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What is painted besides or otherwise, how it is taken, and by which lenses; `most_mm` of mean error, on which
-    field; by what else than the camera above it, and by how much coma at the rim, of which shape.
+    """A kind of disturbance: what is painted otherwise, how the photograph is taken, the lenses, the largest mean error
+    `most_mm`, the field, a change of the camera, and the amount of coma at the rim with its shape.
     """
 
     painter: Painter | None = None
@@ -90,15 +91,15 @@ class Kind:
 
 
 def cropped(camera: Camera, rng: np.random.Generator) -> Camera:
-    """A part of a larger sensor, away from the middle of its lens."""
+    """A part of a larger sensor, away from the centre of its lens."""
     away = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.15, 0.3, 2) * np.array(SIZE)
     x, y = np.array(camera.principal_point) + away
     return replace(camera, principal_point=(float(x), float(y)))
 
 
 def with_coma(image: Image8, camera: Camera, rim_px: float, shape: tuple[Array, Array]) -> Image8:
-    """A picture whose light is drawn out by shifts with weights, about where their mean stays; in proportion to how far
-    from the middle it is, by so much at the rim.
+    """The picture convolved with a point spread of these shifts and weights, centred at their mean. Its size is
+    proportional to the distance from the principal point, and `rim_px` at the rim.
     """
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     cx, cy = camera.principal_point
@@ -137,8 +138,8 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def taken(name: str, seed: int, field: Target) -> Taken:
-    """Photograph number `seed` of a kind, of this field."""
+def taken(name: str, seed: int, field: Target) -> DisturbedShot:
+    """Photograph number `seed` of a kind of disturbance, with this field."""
     kind = KINDS[name]
     rng = np.random.default_rng([23, seed, *name.encode()])
     phi, lens = LENSES[kind.lenses[seed % len(kind.lenses)]]
@@ -164,14 +165,16 @@ def taken(name: str, seed: int, field: Target) -> Taken:
     painted = custom(curves=curves if kind.painter is None else kind.painter(curves, field, rng))
     scene = field_scene(painted, {"overhead": camera}, {"overhead": Station("overhead", pose)})
     image = photograph(scene, "overhead", "0001", how, seed).image
-    return Taken(camera, painted, with_coma(image, camera, kind.coma_px, kind.coma()) if kind.coma_px else image)
+    return DisturbedShot(
+        camera, painted, with_coma(image, camera, kind.coma_px, kind.coma()) if kind.coma_px else image
+    )
 
 
-# ---- what comes of it -----------------------------------------------------------------------------------------------
+# ---- results --------------------------------------------------------------------------------------------------------
 
 
-def came_of(shot: Taken, asked: Target) -> Outcome:
-    """Found without a start, calibrated, and compared with the truth."""
+def came_of(shot: DisturbedShot, asked: Target) -> Outcome:
+    """The field is found without an initial camera, calibrated, and compared with the truth."""
     length, width = (asked.dimensions[f"field_{side}_m"] for side in ("length", "width"))
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 10) * length, np.linspace(-0.5, 0.5, 7) * width)
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -184,7 +187,7 @@ def came_of(shot: Taken, asked: Target) -> Outcome:
 
 
 def disturbed_rows(runs: int, kinds: Sequence[str] = tuple(KINDS)) -> Iterator[Row]:
-    """Each kind: how many are found, in time, how well, and whether the statement holds."""
+    """For each kind: share found, time, accuracy, and honesty of the stated accuracy."""
     for name in kinds:
         kind, every = KINDS[name], []
         for seed, one in enumerate(over(partial(_disturbed, name), range(runs))):
@@ -236,8 +239,8 @@ OTHERS: dict[str, dict[str, float]] = {
 }
 
 
-def other(name: str, seed: int) -> tuple[Taken, Target]:
-    """A photograph of another field, or of none, and what is asked for."""
+def other(name: str, seed: int) -> tuple[DisturbedShot, Target]:
+    """A photograph of another field, or of none, and the target that is asked for."""
     kind = ("plain", "boundary", "cables", "seams")[seed % 4]
     if name == "B for A":
         return taken(kind, seed, ssl_field("B")), ssl_field("A")
@@ -253,7 +256,7 @@ def other(name: str, seed: int) -> tuple[Taken, Target]:
 
 
 def wrong_rows(runs: int) -> Iterator[Row]:
-    """Other fields than the one that is asked for: none may be certified."""
+    """Photographs of other fields than asked for: none may be certified."""
     names = (*OTHERS, "B for A", "A for B", "none")
     certified: dict[str, list[str]] = {name: [] for name in names}
     asked = [(names[number % len(names)], number // len(names)) for number in range(runs)]

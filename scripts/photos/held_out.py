@@ -1,9 +1,10 @@
-"""How well the default lens predicts views that it has not seen: python scripts/run.py held_out [--help]
+"""Prediction of held-out views with the default lens: python scripts/run.py held_out [--help]
 
-Every real set of boards is cut into two halves, views in turn; each half is calibrated by the defaults and with each
-lens that somebody may name, and the other half's boards are posed under it. The root mean square of what is left, over
-the corners that every lens keeps, stands beside that of the best named lens. Exits with 1 where the default is more
-than 3 % worse. The folder of real sets is $CERES_CAL_REAL, or shared/real beside the repository.
+Every real set of boards is split into two halves, views in turns. Each half is calibrated with the default options and
+with each lens that a user may name, and the poses of the other half's boards are fitted with it. The root mean square
+of the residuals, over the corners that every lens keeps, is compared with that of the best named lens. Exits with 1
+where the default is more than 3 % worse. The folder of real sets is $CERES_CAL_REAL, or shared/real beside the
+repository.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ LENSES: Mapping[str, Options] = {
     "brown": Options(lens="brown"),
     "kannala-brandt": Options(lens="kannala-brandt"),
 }
-"""The named ones have what is usual of cameras, as the default has."""
+"""The named ones have the default's priors on usual cameras."""
 
 
 def _photographed(pattern: str, columns: int, rows: int, square_m: float) -> Observations:
@@ -65,7 +66,7 @@ def _of_views(observations: Observations, chosen: Mask) -> Observations:
 
 
 def left_px(options: Options, known: Observations, new: Observations) -> tuple[Array, Mask]:
-    """(N,) px that a calibration by some observations leaves of others, and (N,) what it keeps of them."""
+    """(N,) residuals, px, of new observations with a calibration from known ones, and (N,) which of them it keeps."""
     calibration = calibrate(known, options)
     (answer,) = score(calibration, new).values()
     assert answer.solution is not None
@@ -74,7 +75,7 @@ def left_px(options: Options, known: Observations, new: Observations) -> tuple[A
 
 
 def rows(name: str, observed: Callable[[], Observations], runs: int) -> Iterator[Row]:
-    """Of each lens the error of prediction, and how much worse the default is than the best named one."""
+    """Prediction error of each lens, and the ratio of the default's error to that of the best named lens."""
     observations = observed()
     number = np.arange(len(observations.views))
     halves = [_of_views(observations, number % 2 == half) for half in range(2)]

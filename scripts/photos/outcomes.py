@@ -1,4 +1,4 @@
-"""What comes of one photograph of a field whose truth is known: detected, calibrated, and compared."""
+"""Result for one photograph of a field with known truth: detected, calibrated, and compared."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ceres_cal.report.grounds import judge_quality, promises
 from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.targets import Target
 
-USUAL_MM, MOVED_MM = 1.5, 3.0  # mean error of a map, as small pictures allow; of several disturbances, or motion
-STATED = 1.6  # of errors over what is stated, either way
-WRONG = 4.0  # of the same, from which on a calibration is wrong without saying so
+USUAL_MM, MOVED_MM = 1.5, 3.0  # limits of the mean map error: usual; with several disturbances or motion
+STATED = 1.6  # limit of the error over the stated one, and of its inverse
+WRONG = 4.0  # with a larger ratio a calibration is wrong without saying so
 BEYOND, MOST_BEYOND = 1.5, 0.02  # times the 95 % radius, and the share of places that may lie farther off
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Seconds of the detection; mean, median and rms error of the map over the field, mm, and the stated one; the share
-    of its places far beyond their 95 % radius; the lens that was chosen, the verdict on the calibration and whether it
-    states an accuracy; or why there is none.
+    """Seconds of the detection; mean, median and rms error of the map over the field, mm, and the stated error; the
+    share of places far beyond their 95 % radius; the chosen lens, the verdict on the calibration, and whether it states
+    an accuracy; or the reason of a refusal.
     """
 
     seconds: float
@@ -48,7 +48,7 @@ class Outcome:
 
     @property
     def certified(self) -> bool:
-        """Whether it is trusted though it is wrong."""
+        """Whether the calibration is trusted although it is wrong."""
         return self.trusted and (self.over_stated > WRONG or self.beyond > MOST_BEYOND)
 
 
@@ -56,7 +56,7 @@ def outcome(path: Path, asked: Target, start: Auto | Clicks, truth: tuple[Array,
     """Detect, calibrate, and compare with the truth.
 
     Args:
-        truth: pixels (N, 2), and where on the field they lie (N, 2), m.
+        truth: pixels (N, 2), and their places on the field (N, 2), m.
     """
     began = time.perf_counter()
     try:

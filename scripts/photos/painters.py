@@ -1,4 +1,4 @@
-"""What is painted on other people's floors besides a field, or otherwise than its rules say."""
+"""Lines on real floors that do not belong to the field, or differ from its rules."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def with_cables(curves: dict[str, Curve], field: Target, rng: np.random.Generato
 
 
 def worn(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """A third to a half of every line is gone, piece by piece."""
+    """A third to a half of every line is worn off, piece by piece."""
     kept: dict[str, Curve] = {}
     share = rng.uniform(0.5, 0.7)
     for name, curve in curves.items():
@@ -65,7 +65,7 @@ def _part(curve: Curve, first: float, last: float) -> Curve:
 
 
 def askew(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """Three lines 15 to 30 mm aside."""
+    """Three lines are displaced by 15 to 30 mm."""
     moved = dict(curves)
     names = [name for name, curve in curves.items() if isinstance(curve, Segment)]
     for name in rng.choice(names, 3, replace=False):
@@ -79,7 +79,7 @@ def askew(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> 
 
 
 def with_another_sport(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """Wide lines of another sport, parallel to the field's, right over it."""
+    """Wide lines of another sport, parallel to the field's and across it."""
     length, width = field.dimensions["field_length_m"], field.dimensions["field_width_m"]
     wide, others = rng.uniform(0.02, 0.05), dict(curves)
     for number in range(int(rng.integers(2, 5))):
@@ -92,7 +92,7 @@ def with_another_sport(curves: dict[str, Curve], field: Target, rng: np.random.G
 
 
 def with_old_field(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """What is left of another field: smaller, beside, of the same paint."""
+    """Remains of another field: smaller, displaced, and with the same paint."""
     smaller, moved = rng.uniform(0.75, 0.95, 2), rng.uniform(-0.4, 0.4, 2)
     lengths = {
         f"{name}_m": smaller[n] * field.dimensions[f"{name}_m"]
@@ -107,8 +107,8 @@ def with_old_field(curves: dict[str, Curve], field: Target, rng: np.random.Gener
 
 
 def as_farmers_do(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """Every line of a large pitch aside by centimetres, half of the width of its paint; circles and arcs, which are
-    drawn by a rope about a peg, have their middles and radii off by as much.
+    """Every line of a large pitch is displaced by centimetres, with a standard deviation of half the width of its
+    paint. Circles and arcs, which are drawn with a rope around a peg, have centres and radii with such errors.
     """
     moved = dict(curves)
     for name, line in curves.items():

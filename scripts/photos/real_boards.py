@@ -1,11 +1,11 @@
-"""Real photographs of boards, as OpenCV calibrates them: python scripts/run.py real_boards [--help]
+"""Real photographs of boards, compared with OpenCV's calibration: python scripts/run.py real_boards [--help]
 
-By plain least squares, BoofCV's Sony with two radial coefficients and the wide GoPro with three. OpenCV itself leaves
-0.1624 and 0.5235 px of its own corners, with a focal length of 700.93 and 560.07 px; the corners that `detect board`
-measures by saddles leave less. BabelCalib's very wide OV camera by plain least squares: of its test views the poses
-alone are solved for; scipy leaves 0.482 px in training and 0.475 px there. "Stated": the noise that a calibration
-finds over the standard deviation that is stated of corners, with the board as drawn and, by default, as it was built.
-Exits with 1 when a figure is missed.
+Plain least squares, with two radial coefficients for BoofCV's Sony and three for the wide GoPro. OpenCV itself has
+residuals of 0.1624 and 0.5235 px for its own corners, with focal lengths of 700.93 and 560.07 px; the corners that
+`detect board` measures by saddles have smaller residuals. BabelCalib's very wide OV camera is calibrated by plain least
+squares, and only the poses of its test views are fitted; scipy has residuals of 0.482 px in training and 0.475 px in
+the test. "Stated": the noise that a calibration estimates over the stated standard deviation of corners, with the board
+as drawn and, by default, as built. Exits with 1 when a figure is missed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def very_wide(runs: int) -> Iterator[Row]:
 
 
 def stated(runs: int) -> Iterator[Row]:
-    """Noise over the corners' stated standard deviations, by defaults and with the board as it was built."""
+    """Noise over the corners' stated standard deviations, with the board as drawn and, by default, as built."""
     sets = {"left": ("opencv_left_right/left*.jpg", 9, 6), "right": ("opencv_left_right/right*.jpg", 9, 6)}
     sets |= {"sony": ("boofcv_sony_chess/*.jpg", 4, 6), "gopro": ("udacity_gopro_wide/GOPR*.jpg", 8, 6)}
     for name, (pattern, columns, rows) in sets.items():

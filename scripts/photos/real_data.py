@@ -1,4 +1,4 @@
-"""Where real photographs are, which are not part of the repository."""
+"""Folder of the real photographs, which are not part of the repository."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ceres_cal.scene.targets import checkerboard
 
 
 def real_place() -> Path:
-    """$CERES_CAL_REAL, or shared/real beside the repository, whether it is there or not."""
+    """$CERES_CAL_REAL, or shared/real beside the repository; it need not exist."""
     return Path(os.environ.get("CERES_CAL_REAL") or Path(__file__).resolve().parents[3] / "shared" / "real")
 
 
 def real_folder() -> Path:
-    """The same; where it is missing the program says so and ends with 1."""
+    """The same; if it is missing, the program prints a message and ends with 1."""
     folder = real_place()
     if not folder.is_dir():
         raise SystemExit(f"real photographs are needed, and {folder} is not there: set CERES_CAL_REAL to their folder")
@@ -25,7 +25,7 @@ def real_folder() -> Path:
 
 
 def ov_plane(part: str) -> Observations:
-    """BabelCalib's corners of the "train" or the "test" views of its OV camera, which come as numbers."""
+    """BabelCalib's corners of the "train" or the "test" views of its OV camera, which are published as numbers."""
     with np.load(real_folder() / "babelcalib_ov_plane" / f"{part}.npz") as data:
         board, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
     pitch_m = float(board[0, 0])

@@ -25,14 +25,14 @@ _CORNERS = (
     *("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner"),
     *("BottomHalfwayCrossing", "TopHalfwayCrossing"),
 )
-_LEAST_AREA = 0.01  # of the picture, of the triangle of any three places that are clicked
-_SOUND = 0.9  # of sound pictures, the share that is trusted for something
+_LEAST_AREA = 0.01  # share of the picture, for the triangle of any three clicked places
+_SOUND = 0.9  # share of correct calibrations that must be trusted for something
 ALLOWED_MM = {"combo": MOVED_MM, "camera": MOVED_MM}  # by kind
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """A photograph and what is known of it."""
+class KnownPhotograph:
+    """A photograph and its truth."""
 
     path: Path
     truth: dict[str, Any]
@@ -48,14 +48,14 @@ class Known:
 
     @property
     def ways(self) -> tuple[str, ...]:
-        """How it may be started from: a mirrored picture shows by corners that it is; where few places are in the
-        picture that have a name, nobody can click them.
+        """Possible kinds of start. A mirrored picture can only be noticed with corners, so "auto" is left out for it;
+        "clicks" needs four corners with a name in the picture.
         """
         mirrored = "mirrored" in self.truth.get("what", "")
         return (*(() if mirrored else ("auto",)), *(("clicks",) if self._shown else ()))
 
     def floor(self, height: str = "field_m_at_0_mm") -> tuple[Array, Array]:
-        """Pixels (N, 2) that show the field, and where on it they lie, m."""
+        """Pixels (N, 2) that show the field, and their places on it, m."""
         pixels, places = (np.array(one, dtype=float) for one in self._seen(height))
         painted = self.truth["field_as_painted"]
         inside = np.all(np.abs(places) <= 0.5 * np.array([painted["L"], painted["W"]]), axis=1)
@@ -67,7 +67,7 @@ class Known:
 
     @cached_property
     def _shown(self) -> tuple[str, ...]:
-        """Four corners or crossings, well apart; those of the outline where they are in the picture."""
+        """Names of four corners or crossings, well apart; those of the outline where they are in the picture."""
         corners, target = self.truth["corners_px"], targets_by_name()[self.truth["asked_as"]]
         if sum(name in corners for name in _CORNERS) < 4:
             pixels, places = (np.array(one) for one in self._seen("field_m_at_0_mm"))
@@ -84,14 +84,14 @@ class Known:
         return best if best and spread(corners, best) > least else ()
 
     def clicks(self) -> Clicks:
-        """These clicked roughly."""
+        """These corners, clicked with random errors."""
         rng = np.random.default_rng([5, sum(map(ord, self.name))])
         corners = self.truth["corners_px"]
         return Clicks({name: tuple(np.array(corners[name]) + rng.normal(0.0, CLICK_PX, 2)) for name in self._shown})
 
 
 def spread(corners: Mapping[str, Sequence[float]], names: Sequence[str]) -> float:
-    """The least area of three of these points, px^2."""
+    """The smallest area of a triangle of these points, times two, px^2."""
     areas = [
         np.linalg.det(np.column_stack([[corners[name] for name in three], np.ones(3)]))
         for three in combinations(names, 3)
@@ -99,17 +99,17 @@ def spread(corners: Mapping[str, Sequence[float]], names: Sequence[str]) -> floa
     return float(np.min(np.abs(areas)))
 
 
-def known_photographs(folder: Path) -> list[Known]:
-    """Those of a folder that have a truth beside them."""
+def known_photographs(folder: Path) -> list[KnownPhotograph]:
+    """The photographs of a folder that have a truth beside them."""
     known = []
     for path in sorted(folder.glob("*.truth.json")):
         truth = json.loads(path.read_text(encoding="utf-8"))
-        known.append(Known(folder / truth["picture"], truth))
+        known.append(KnownPhotograph(folder / truth["picture"], truth))
     return known
 
 
 def shared_rows(folders: Iterable[Path]) -> Iterator[Row]:
-    """Every photograph without a start and from four rough clicks; other fields are refused, or not trusted."""
+    """Every photograph without a start and from four rough clicks; other fields must be refused or not trusted."""
     every = [shown for folder in folders for shown in known_photographs(folder)]
     asked = [(shown, how) for shown in every for how in shown.ways]
     found: dict[str, list[Outcome]] = {}
@@ -120,13 +120,13 @@ def shared_rows(folders: Iterable[Path]) -> Iterator[Row]:
     yield from _of_all(found)
 
 
-def came_of_known(shown: Known, how: str) -> Outcome:
-    """What comes of one photograph, by "auto" or by "clicks"."""
+def came_of_known(shown: KnownPhotograph, how: str) -> Outcome:
+    """Result for one photograph, started by "auto" or by "clicks"."""
     start = shown.clicks() if how == "clicks" else Auto((Facing(*shown.truth["facing"].split("=")),))
     return outcome(shown.path, targets_by_name()[shown.truth["asked_as"]], start, shown.floor())
 
 
-def _rows(shown: Known, how: str, came: Outcome) -> Iterator[Row]:
+def _rows(shown: KnownPhotograph, how: str, came: Outcome) -> Iterator[Row]:
     case = f"{shown.name}, {how}"
     note = f"{came.seconds:.1f} s, {came.lens}"
     print(f"{case}: {came.why or came.verdict}", file=sys.stderr)
@@ -145,9 +145,9 @@ def _rows(shown: Known, how: str, came: Outcome) -> Iterator[Row]:
 def _of_all(found: Mapping[str, Sequence[Outcome]]) -> Iterator[Row]:
     note = f"{len(found)} photographs"
     both = float(np.mean([not any(one.why for one in ways) for ways in found.values()]))
-    yield Row("all that can be told", "share found in every way", both, least=0.95, note=note)
+    yield Row("all photographs", "share found in every way", both, least=0.95, note=note)
     every = [one for ways in found.values() for one in ways if not one.why]
-    yield Row("all that can be told", "wrong, but trusted", sum(one.certified for one in every), most=0.0)
+    yield Row("all photographs", "wrong, but trusted", sum(one.certified for one in every), most=0.0)
     sound = [one for one in every if not one.beyond > MOST_BEYOND and one.mean_mm < MOVED_MM]
     trusted = float(np.mean([one.trusted for one in sound]))
     yield Row("sound", "share trusted for something", trusted, least=_SOUND, note=f"{len(sound)} calibrations")

@@ -1,5 +1,5 @@
-"""Rendered photographs of varied lens, light, blur, wear and robots, whose truth is known, a real one, and how well
-lines, crossings and rings are read in them.
+"""Rendered photographs with varied lens, light, blur, wear and robots, whose truth is known, and a real one; accuracy
+of lines, crossings and rings that are detected in them.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Shot:
 
 
 def varied(seed: int) -> Photography:
-    """Light, blur, wear and robots of one photograph: every other one in good light."""
+    """Light, blur, wear and robots of one photograph; every other one has good light."""
     rng = np.random.default_rng([7, seed])
     how = Photography(
         blur_px=float(rng.uniform(0.4, 1.0)),
@@ -117,18 +117,18 @@ def take(seed: int) -> Shot:
 
 
 def turned(camera: Camera, turn: Sequence[float] | Array) -> Camera:
-    """The camera, turned in its place by a rotation vector (rad) in its own frame."""
+    """The camera rotated in its place by a rotation vector (rad) in its own frame."""
     return camera.at(Pose.looking(camera.position, rotation_exp(turn) @ camera.cam_from_world.rotation))
 
 
 def off_by(camera: Camera, angle_rad: float, seed: int) -> Camera:
-    """The camera turned by an angle about any axis that lies in the image."""
+    """The camera rotated by an angle about a random axis in the image plane."""
     direction = np.random.default_rng([3, seed]).uniform(0.0, 2.0 * np.pi)
     return turned(camera, [angle_rad * np.cos(direction), angle_rad * np.sin(direction), 0.0])
 
 
 def distances_px(shot: Shot, curve: Indices32, pixels: Array) -> Array:
-    """(N,) distance of pixels to the left of their true curves, px."""
+    """(N,) signed distance of pixels from their true curves, px, positive on the left."""
     target, camera = shot.target, shot.camera
     floor = np.column_stack([camera.locate(pixels), np.zeros(len(pixels))])
     tracks, is_arc = target.tracks[0][curve], target.is_arc[curve]
@@ -146,7 +146,7 @@ def distances_px(shot: Shot, curve: Indices32, pixels: Array) -> Array:
 
 
 def hidden_places(shot: Shot, pixels: Array) -> Mask:
-    """(N,) whether a place and two pixels around it are hidden: at the rim of a robot a window still sees paint."""
+    """(N,) whether a place and two pixels around it are hidden; at a robot's rim a search window still sees paint."""
     steps = [(0.0, 0.0), (2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)]
     return np.asarray(np.all([shot.picture.hides(pixels + step) for step in steps], axis=0))
 
@@ -156,7 +156,7 @@ def hidden_places(shot: Shot, pixels: Array) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class LineErrors:
-    """Errors (N,) px of one photograph's line centres, the same in their stated sigmas, and what is hidden there."""
+    """Errors (N,) px of one photograph's line centres, the same in stated sigmas, and numbers of hidden places."""
 
     good_light: bool
     errors_px: Array
@@ -166,7 +166,7 @@ class LineErrors:
 
 
 def line_errors(seed: int) -> LineErrors | None:
-    """What is measured in one photograph from a start that is some pixels off; None where the field is missed."""
+    """Errors in one photograph from an initial camera that is some pixels off; None where the field is missed."""
     shot = take(seed)
     start = off_by(shot.camera, NEAR_PX / shot.camera.phi, seed)
     found = follow(shot.grey, shot.target, [start], shot.target.curve_names)
@@ -180,7 +180,7 @@ def line_errors(seed: int) -> LineErrors | None:
 
 
 def line_figures(seeds: Sequence[int]) -> Iterator[Row]:
-    """Line centres and their sigmas in the photographs of these numbers."""
+    """Line centres and their sigmas in photographs with these numbers."""
     every = [line_errors(seed) for seed in seeds]
     seen = [one for one in every if one is not None]
     missed = len(every) - len(seen)
@@ -201,7 +201,7 @@ def line_figures(seeds: Sequence[int]) -> Iterator[Row]:
 
 
 def clicks(shot: Shot, seed: int) -> Clicks:
-    """Four corners of the half that is seen, clicked roughly."""
+    """Four corners of the visible half, clicked with random errors."""
     rng = np.random.default_rng([5, seed])
     pixels = shot.camera.project([shot.target.points[name] for name in CORNERS])
     shown = pixels + rng.normal(0.0, CLICK_PX, size=pixels.shape)
@@ -215,7 +215,7 @@ def _detected(shot: Shot, start: Camera | Clicks, folder: Path) -> FieldDetectio
 
 
 def floor_error_mm(shot: Shot, camera: Camera) -> Array:
-    """Error of the map on the floor of the half field, at places in view, mm."""
+    """Errors of the map on the floor of the half field, at places in view, mm."""
     x, y = np.meshgrid(np.linspace(-4.5, 0.0, 19), np.linspace(-3.0, 3.0, 25))
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     pixels = shot.camera.project(floor)
@@ -249,7 +249,7 @@ def floor_rows(runs: int) -> Iterator[Row]:
 
 
 def start_rows(runs: int) -> Iterator[Row]:
-    """Starts that are far off: how many arrive, and whether those that do not say so."""
+    """Initial cameras that are far off: how many converge, and whether failures are reported."""
     for name, angle in (("100 px off", None), ("5 degrees off, tilt", OFF_DEG), ("5 degrees off, any axis", OFF_DEG)):
         arrived = silent = 0
         for seed in range(runs):
@@ -270,7 +270,7 @@ def start_rows(runs: int) -> Iterator[Row]:
 
 
 def speed_rows(runs: int) -> Iterator[Row]:
-    """How long a frame takes, from a good start, and to be rendered."""
+    """Time to search a frame from a good initial camera, and to render it."""
     searched, rendered = [], []
     for seed in range(runs):
         began = time.perf_counter()
@@ -302,7 +302,7 @@ def rings_rows(runs: int) -> Iterator[Row]:
 
 
 def real_target() -> Target:
-    """A field of the proportions that the real photograph shows: its size is not known, 4.05 m is a guess."""
+    """A field with the proportions in the real photograph; its size is unknown, 4.05 m is a guess."""
     length, width = 4.05, 3.0
     return ssl_field(
         "B",
@@ -315,7 +315,7 @@ def real_target() -> Target:
 
 
 def real_detection(folder: Path) -> tuple[Path, FieldDetections]:
-    """What is detected in the real photograph of `ssl_tigers_line_corners`, from its four published clicks."""
+    """Detection in the real photograph of `ssl_tigers_line_corners`, from its four published clicks."""
     path = folder / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png"
     target = real_target()
     painted = [name for name in target.curve_names if name not in NOT_PAINTED]
@@ -323,10 +323,10 @@ def real_detection(folder: Path) -> tuple[Path, FieldDetections]:
 
 
 def real_rows(folder: Path, picture: Path | None, seen: tuple[Path, FieldDetections] | None = None) -> Iterator[Row]:
-    """A real photograph of a field of unknown size: lines followed, and their spread when the size is freed.
+    """A real photograph of a field of unknown size: lines followed, and their residuals with free dimensions.
 
     Args:
-        seen: what `real_detection` found in it before.
+        seen: result of an earlier `real_detection`.
     """
     path, found = seen or real_detection(folder)
     followed = found.found[str(path)]
@@ -344,7 +344,7 @@ def real_rows(folder: Path, picture: Path | None, seen: tuple[Path, FieldDetecti
 
 
 def draw(path: Path, found: FieldDetections, picture: Path) -> None:
-    """The photograph with the model (yellow, red where it was not found) and line centres (blue)."""
+    """Draws the photograph with the model (yellow; red where it was not found) and line centres (blue)."""
     image = cv2.imread(str(path))
     assert image is not None
     lines = found.found[str(path)].lines

@@ -1,12 +1,12 @@
-"""How straight the rows of a board are in straightened photographs, beside OpenCV: for photographs.py --case straight.
+"""Straightness of a board's rows in undistorted photographs, with OpenCV's: for photographs.py --case straight.
 
-Real photographs of a wide-angle camera (udacity_gopro_wide). The camera is calibrated from its boards with three radial
-coefficients; each photograph is straightened as `undistort --whole` does it, corners are measured in the straight image
-(cornerSubPix, as our own detector does), and a line is fitted to every row and column of them. OpenCV is calibrated
-from the same corners and straightens into the same pinhole.
+The photographs are real, by a wide-angle camera (udacity_gopro_wide). The camera is calibrated from its boards with
+three radial coefficients. Each photograph is undistorted as by `undistort --whole`, corners are measured in the result
+(cornerSubPix, as in our own detector), and a line is fitted to every row and column. OpenCV is calibrated from the same
+corners and undistorts to the same pinhole.
 
-The sheet is creased: with --tolerance its corners turn out to lie half a percent of a square aside (1679 corners of all
-photographs agree on that). In test_image a square has up to 175 px, so its rows cannot be straight to 0.3 px.
+The sheet is creased: --tolerance shows that its corners are displaced by half a percent of a square (1679 corners of
+all photographs agree). In test_image a square has up to 175 px, so that its rows cannot be straight to 0.3 px.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ FOLDER = "udacity_gopro_wide"
 COLUMNS, ROWS = 8, 6
 THREE = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0}, as_built="as drawn")
 CLICKS = ((227.0, 205.0), (1112.0, 188.0), (1005.0, 880.0), (367.0, 908.0))
-"""In test_image.jpg, roughly: the outer ones of the four by four corners that lie where the boards were observed."""
+"""Rough pixels in test_image.jpg of the outer ones of four by four corners, in the area where boards were observed."""
 INNER = 4
 MOST_PX = 0.3
-_WINDOWS_PX = (20, 5)  # clicks are rough; then as small as our own detector's
+_WINDOWS_PX = (20, 5)  # large for rough clicks, then as small as in our own detector
 
 
 def distances_px(grid: Array) -> Array:
-    """Of corners (rows, columns, 2) from the lines that fit their rows and columns best."""
+    """Signed distances of corners (rows, columns, 2) from the best lines through their rows and columns, px."""
     return np.concatenate([_off_line(line) for line in (*grid, *grid.swapaxes(0, 1))])
 
 
@@ -50,7 +50,7 @@ def _off_line(pixels: Array) -> Array:
 
 
 def refined(image: Image, grid: Array) -> Array:
-    """Corners (rows, columns, 2) where they are seen in an image, from near them."""
+    """Corners (rows, columns, 2) measured in an image, from initial values near them."""
     grey: Image8 = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.uint8)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
     found = grid.reshape(-1, 1, 2).astype(np.float32)
@@ -61,12 +61,12 @@ def refined(image: Image, grid: Array) -> Array:
 
 
 def in_straight(camera: Camera, straight: Straightening, photograph: Array) -> Array:
-    """Where pixels (N, 2) of the photograph come to lie in the straight image; NaN past the lens's fold."""
+    """Pixels (N, 2) of the photograph mapped to the undistorted image; NaN beyond a fold of the lens."""
     return straight.camera.at(Pose.identity()).project(camera.rays(photograph))
 
 
 def clicked_grid(camera: Camera, straight: Straightening) -> Array:
-    """About where test_image's corners are in its straight image: between the clicks as on a plane."""
+    """Approximate corners of test_image in its undistorted image, by a homography from the clicks."""
     ends = np.array([(0.0, 0.0), (INNER - 1.0, 0.0), (INNER - 1.0, INNER - 1.0), (0.0, INNER - 1.0)])
     homography = homography_from_points(ends, in_straight(camera, straight, np.array(CLICKS)))
     places = np.stack(np.meshgrid(np.arange(INNER), np.arange(INNER)), axis=-1).reshape(-1, 2).astype(float)
@@ -91,11 +91,11 @@ def observed_boards(real: Path) -> BoardDetections:
 
 
 def straight_rows(real: Path, boards: BoardDetections, keep_scale: bool = False, every: int = 1) -> Iterator[Row]:
-    """Of test_image.jpg and of the boards: how far corners lie off their rows and columns, ours and OpenCV's.
+    """Distances of the corners of test_image.jpg and of the boards from straight rows and columns, ours and OpenCV's.
 
     Args:
-        keep_scale: in a straight image as large as keeps the photograph's scale in the middle, not of its size.
-        every: only so manieth board.
+        keep_scale: use a larger undistorted image that keeps the scale at the centre.
+        every: use only every so manieth board.
     """
     camera = calibrate(boards.observations, THREE).station()
     straight = straighten(camera, whole=True, phi=camera.phi if keep_scale else None)
@@ -141,7 +141,7 @@ def _worst(distances: Array) -> float:
 
 
 def all_straight_rows(real: Path) -> Iterator[Row]:
-    """With the scale of the lens's middle kept, and without."""
+    """With the scale at the centre kept, and without."""
     boards = observed_boards(real)
     for keep_scale in (False, True):
         yield from straight_rows(real, boards, keep_scale)

@@ -1,4 +1,4 @@
-"""How often other leagues' fields are found in photographs: `python scripts/photographs.py --case templates`."""
+"""How often fields of other leagues are found in photographs: `python scripts/photographs.py --case templates`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from photos.auto import rows_for, searched, whole
 from photos.shots import LENSES, Shot, varied
 
 USUAL_SIZE = np.array([9.0, 6.0])  # of the field that `whole` looks at
-ROBOTS_FROM_M = 5.0  # on smaller fields the renderer's robots would stand on everything
+ROBOTS_FROM_M = 5.0  # on smaller fields the renderer's robots would hide everything
 GREEN, GREY, WOOD, CLAY, BLUE = (
     *((0.55, 1.25, 0.65), (1.0, 1.0, 1.0), (0.75, 1.25, 1.75)),
     *((0.7, 1.1, 2.2), (1.9, 1.0, 0.5)),
@@ -31,10 +31,10 @@ FLOORS: dict[str, tuple[tuple[float, tuple[float, float, float], tuple[float, fl
     "tape-grid": ((0.3, GREY, YELLOW), (0.15, GREY, WHITE)),
     "": ((0.2, GREEN, WHITE), (0.12, GREEN, WHITE)),
 }
-"""By the beginning of a target's name: brightness and colour of the floor, colour of its lines."""
+"""By the first letters of a target's name: brightness and colour of the floor, colour of its lines."""
 
 
-SMOOTH = ("basketball", "tennis")  # no carpets
+SMOOTH = ("basketball", "tennis")  # floors that are no carpets
 
 
 def known() -> dict[str, Target]:
@@ -44,7 +44,7 @@ def known() -> dict[str, Target]:
 
 
 def floored(name: str, target: Target, seed: int) -> Photography:
-    """Light, blur and wear of `varied`, on a floor as the target's are."""
+    """Light, blur and wear of `varied`, with a floor that is usual for the target."""
     floors = next(floors for begins, floors in FLOORS.items() if name.startswith(begins))
     carpet, carpet_colour, paint_colour = floors[seed // 2 % len(floors)]
     how = replace(varied(seed), carpet=carpet, carpet_colour=carpet_colour, paint_colour=paint_colour)
@@ -55,7 +55,7 @@ def floored(name: str, target: Target, seed: int) -> Photography:
 
 
 def take_field(name: str, target: Target, seed: int) -> Shot:
-    """Photograph number `seed` of a target seen whole, or nearly."""
+    """Photograph number `seed` of a target that is seen whole, or nearly."""
     rng = np.random.default_rng([13, seed, len(name)])
     phi, lens = LENSES[seed // 2 % len(LENSES)]
     optics = Camera((1280, 960), phi, (640.0 + rng.normal(0.0, 8.0), 480.0 + rng.normal(0.0, 8.0)), lens)
@@ -73,7 +73,7 @@ def take_field(name: str, target: Target, seed: int) -> Shot:
 
 
 def template_rows(runs: int) -> Iterator[Row]:
-    """Every template, each in as many photographs; an old calibration says which way round."""
+    """Every template, each in as many photographs; an older calibration resolves the symmetry."""
     for name, target in known().items():
         outcomes = searched(take_field(name, target, seed) for seed in range(runs))
         yield from rows_for(f"auto, {name}", outcomes, 0.95)

@@ -1,4 +1,4 @@
-"""Photographs beside simulated observations: image files, what they hide, and their truth."""
+"""Photographs of simulated observations: image files, what is hidden in them, and their truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Album:
     Attributes:
         simulation: without the observations that a robot or a ball hides in its photograph.
         images: name of the file below the folder -> its content.
-        truth: for each image the robots, balls and shadows, and the hidden stretches of every curve in metres along it.
+        truth: for each image the robots, balls and shadows, and the hidden parts of every curve in metres along it.
     """
 
     simulation: Simulation
@@ -54,7 +54,7 @@ def take_album(
     Images are `photographs/FRAME.png`, or `photographs/STATION/FRAME.png` where there are several stations.
 
     Args:
-        ending: "png", or "jpg": then compressed as the scene's photography says, at quality 95 where it says nothing.
+        ending: "png", or "jpg"; then the scene's photography gives the quality, 95 by default.
         progress: called after each image with (images done, images in all, file name).
 
     Raises:
@@ -81,7 +81,7 @@ def take_album(
 
 
 def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: Indices32) -> Mask:
-    """Which rows a photograph shows something in front of."""
+    """Rows of observations that are hidden in a photograph."""
     here = np.array([(v.station, v.frame) == (shot.station, shot.frame) for v in simulation.observations.views])
     rows = here[view]
     rows[rows] = shot.hides(truth.pixels[rows])

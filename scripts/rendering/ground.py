@@ -1,4 +1,4 @@
-"""What makes the ground of a photograph uneven: stripes of sun, strips of carpet that meet in seams, a lamp's glare."""
+"""Unevenness of the ground in a photograph: stripes of sun, strips of carpet with seams, glare of a lamp."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.scene.camera import Camera
 from rendering.photography import Photography
 
-_PERIOD_M, _SUNNY = (0.7, 2.0), (0.2, 0.6)  # of stripes of sun, and the share of it that is in the sun
-_STRIP_M, _SEAM_M, _SEAM = (0.8, 2.0), 0.012, (-0.5, 0.8)  # wide: strips and seams; how much brighter a seam is
+_PERIOD_M, _SUNNY = (0.7, 2.0), (0.2, 0.6)  # period of stripes of sun, and the sunny share of it
+_STRIP_M, _SEAM_M, _SEAM = (0.8, 2.0), 0.012, (-0.5, 0.8)  # widths of strips and seams; relative brightness of a seam
 _GLARE_M, _GLARE_PLACE_M = (0.2, 0.6), 2.5
 _EDGE_M = 0.01
 _NONE = np.zeros((), np.float32)
@@ -19,8 +19,8 @@ _NONE = np.zeros((), np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Planes (height, width), or one number for all: light that the sun adds to the lamps', what the carpet's
-    brightness is multiplied by, and what is mirrored besides, a share of white.
+    """Planes (height, width), or one number for all pixels: sunlight in addition to the lamps', factor of the carpet's
+    brightness, and mirrored light, as a share of white.
     """
 
     sun: Array32
@@ -29,7 +29,7 @@ class Ground:
 
 
 def ground_of(camera: Camera, how: Photography, rng: np.random.Generator) -> Ground:
-    """The ground that a camera sees; places that it does not see as floor have none of that."""
+    """The ground that a camera sees; pixels that show no floor are unchanged."""
     if max(how.sun, how.strips, how.glare) == 0.0:
         return Ground(_NONE, _NONE + np.float32(1.0), _NONE)
     width, height = camera.image_size
@@ -45,7 +45,7 @@ def ground_of(camera: Camera, how: Photography, rng: np.random.Generator) -> Gro
 
 
 def _stripes(place: Array, rng: np.random.Generator) -> Array:
-    """1 in the sun, as it falls through a row of windows."""
+    """1 in the sun, which falls through a row of windows."""
     direction, period = rng.uniform(0.0, np.pi), rng.uniform(*_PERIOD_M)
     along = place @ (np.cos(direction), np.sin(direction)) + rng.uniform(0.0, period)
     away = np.abs(np.mod(along, period) - 0.5 * period)
@@ -53,7 +53,7 @@ def _stripes(place: Array, rng: np.random.Generator) -> Array:
 
 
 def _strips(place: Array, uneven: float, rng: np.random.Generator) -> Array:
-    """Brightness of strips of carpet along the field or across, with something of a line where they meet."""
+    """Brightness of strips of carpet along or across the field, with a faint line where they meet."""
     along, wide = place[..., int(rng.integers(2))] + rng.uniform(0.0, 1.0), rng.uniform(*_STRIP_M)
     number = np.floor(along / wide)
     tone = 1.0 + uneven * rng.uniform(-1.0, 1.0, 64)

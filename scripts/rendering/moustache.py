@@ -1,4 +1,4 @@
-"""A lens whose distortion grows and falls again towards the rim, by a formula that none of the package's models has."""
+"""A lens whose distortion grows and decreases again towards the rim, which no model of the package describes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.scene.lens import Lens
 
-_FARTHEST, _STEPS = 4.0, 200_000  # tangent up to which, and places at which, it is inverted
+_FARTHEST, _STEPS = 4.0, 200_000  # largest tangent, and number of samples, of its inverse
 
 
 @dataclass(frozen=True)
 class Moustache(Lens):
-    """The radius is t - amount t^3 / (1 + (t / bend)^4), t the tangent of the angle from the axis, times phi."""
+    """The radius is phi (t - amount t^3 / (1 + (t / bend)^4)), where t is the tangent of the angle from the axis."""
 
     values: tuple[float, ...] = (0.0, 1.0)
     kind: ClassVar[str] = "moustache"

@@ -1,4 +1,4 @@
-"""How much of a printed target is dark: of each small square of a picture, its share."""
+"""Coverage of a printed target: the dark share of each small square of a picture."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Footprints:
     """Small squares of a picture on the target's plane z = const.
 
     Attributes:
-        plane: (M, 2) their middles, m. along_x, along_y: (M, 2) what a step of one square to the right and down is on
-            the plane, m.
+        plane: (M, 2) their centres, m. along_x, along_y: (M, 2) steps on the plane, m, for one square to the right and
+            down.
     """
 
     plane: Array
@@ -24,18 +24,18 @@ class Footprints:
     along_y: Array
 
     def step_m(self, direction: Array) -> Array:
-        """(M,) how far the place moves along a direction (M, 2) over one square, m."""
+        """(M,) change along a direction (M, 2) over one square, m."""
         across = dots(self.along_x, direction), dots(self.along_y, direction)
         return np.asarray(np.maximum(np.hypot(*across), 1e-12))
 
 
 def share_inside(distance: Array, step: Array) -> Array:
-    """The share of a square that lies on the positive side of a straight border, from the middle's distance to it."""
+    """The share of a square on the positive side of a straight border, from the distance of its centre."""
     return np.clip(distance / step + 0.5, 0.0, 1.0)
 
 
 def dark_share(target: Target, footprints: Footprints) -> Array:
-    """(M,) of the squares on a checkerboard, a grid of circles or a sheet of rings."""
+    """(M,) dark share of squares on a checkerboard, a grid of circles or a sheet of rings."""
     spec = target.spec
     if target.kind == "rings":
         return _dark_rings(np.array(spec["radii_m"]), footprints)
@@ -47,7 +47,7 @@ def dark_share(target: Target, footprints: Footprints) -> Array:
 
 
 def _dark_squares(grid: Grid, footprints: Footprints) -> Array:
-    """The square between "0,0" and "1,1" is dark, and so is, beyond the outer corners, one more square each way."""
+    """The square between "0,0" and "1,1" is dark; there is one more row of squares outside the outer corners."""
     sign, within = np.full(len(footprints.plane), 1.0), np.full(len(footprints.plane), 1.0)
     for axis, count in enumerate((grid.columns, grid.rows)):
         place = footprints.plane[:, axis] / grid.spacing_m
@@ -60,7 +60,7 @@ def _dark_squares(grid: Grid, footprints: Footprints) -> Array:
 
 
 def _dark_circles(grid: Grid, radius_m: float, asymmetric: bool, footprints: Footprints) -> Array:
-    """Of the two rows around a place the nearer circle decides: circles do not meet."""
+    """The nearest circle of the two rows around a place decides, since circles do not touch."""
     step, x, y = (2.0 if asymmetric else 1.0), *(footprints.plane.T / grid.spacing_m)
     offs = []
     for below in (0.0, 1.0):
@@ -75,7 +75,7 @@ def _dark_circles(grid: Grid, radius_m: float, asymmetric: bool, footprints: Foo
 
 
 def _dark_rings(radii: Array, footprints: Footprints) -> Array:
-    """The disc inside the first ring is dark, and from then on every other ring."""
+    """The disc inside the first ring is dark, and so is every other ring."""
     away = np.maximum(np.hypot(footprints.plane[:, 0], footprints.plane[:, 1]), 1e-12)
     step = footprints.step_m(footprints.plane / away[:, None])
     inner = np.searchsorted(0.5 * (radii[1:] + radii[:-1]), away)  # the nearest edge

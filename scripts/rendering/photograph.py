@@ -1,4 +1,4 @@
-"""Photographs of a scene: targets, what stands about, light, lens blur and sensor, with their truth."""
+"""Photographs of a scene: targets, robots and other things, light, lens blur and sensor, with their truth."""
 
 from __future__ import annotations
 
@@ -21,26 +21,25 @@ from rendering.things import Ball, Box, Robot, Shadow, Thing, outline, patches, 
 Stretches = Mapping[str, tuple[tuple[float, float], ...]]
 """Curve -> (from, to) m along it."""
 
-_TRACE_PX = 0.25  # how finely curves are followed for what hides them
+_TRACE_PX = 0.25  # step along curves in the search for hidden parts
 _PENUMBRA_PX = 12.0
-_LIGHT_STEP = 8  # light changes slowly: it is drawn at an eighth of the size
+_LIGHT_STEP = 8  # light changes slowly, so it is drawn at an eighth of the size
 _WEAR_PATCH_PX, _BLOTCH_PX = 2.0, 30.0
 _TRIES = 200
 _LARGEST_BOX = (0.9, 0.5, 1.4, np.pi, 0.7, 0.7, 0.7)  # half sides and height, m, turn and colour
-_FINE = 8  # parts of a pixel in which a camera's way is drawn
-_GROUND = 1  # its random numbers are its own: pictures without it stay what they are
+_FINE = 8  # parts of a pixel in the drawing of a camera's motion
+_GROUND = 1  # own random numbers, so that pictures without it do not change
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """One photograph and what is true of it.
+    """One photograph and its truth.
 
     Attributes:
-        station, frame: which one. targets: names of the targets it shows, with their placements.
+        station, frame: of the photograph. targets: names of the targets it shows, with their placements.
         image: (height, width, 3) uint8, blue green red.
         things: robots and balls. shadows: of people.
-        hidden: target -> curve -> stretches of it, in metres along the curve, that lie inside the image behind a robot
-            or a ball.
+        hidden: target -> curve -> its parts inside the image that a robot or a ball hides, in metres along the curve.
         cover: (height, width) * render.SUBPIXELS, above 0 where a robot or ball is.
     """
 
@@ -54,7 +53,7 @@ class Photograph:
     cover: Image8 = field(repr=False)
 
     def hides(self, pixels: Array) -> Mask:
-        """(N,) whether a robot or a ball is in front of each pixel (N, 2); outside the image nothing is."""
+        """(N,) whether a robot or a ball hides each pixel (N, 2); False outside the image."""
         return _covered(self.cover, pixels)
 
 
@@ -72,11 +71,11 @@ def photographs(scene: Scene, photography: Photography | None = None, seed: int 
 def photograph(
     scene: Scene, station: str, frame: str, photography: Photography | None = None, seed: int = 0
 ) -> Photograph:
-    """The photograph that a station takes in a frame: all targets which the scene shows there.
+    """The photograph that a station takes in a frame, with all targets that the scene has there.
 
-    Fields and other custom targets are painted on the floor (curves with a width; points and bare edges are not seen),
-    boards and rings are sheets of paper before it. Where something is shown that lies in the world, robots, balls and
-    shadows are placed at random on the floor that the camera sees. The same arguments give the same picture.
+    Fields and other custom targets are painted on the floor (only curves with a width; points and bare edges are not
+    seen), boards and rings are sheets of paper in front of it. If a target of the world is shown, robots, balls and
+    shadows are placed at random on the visible floor. The same arguments give the same picture.
 
     Args:
         photography: the scene's own by default.
@@ -96,7 +95,7 @@ def photograph(
     return Photograph(station, frame, shown, _compressed(image, how), things, shadows, hidden, drawn[1])
 
 
-# ---- what stands where ----------------------------------------------------------------------------------------------
+# ---- places of things -----------------------------------------------------------------------------------------------
 
 
 def _placed(camera: Camera, how: Photography, rng: np.random.Generator) -> tuple[tuple[Thing, ...], tuple[Shadow, ...]]:
@@ -110,11 +109,11 @@ def _placed(camera: Camera, how: Photography, rng: np.random.Generator) -> tuple
         for x, y in _places(camera, how.shadows, 0.0, rng)
     )
     by_distance = sorted(robots, key=lambda robot: -np.hypot(*(camera.position[:2] - (robot.x_m, robot.y_m))))
-    return (*balls, *by_distance, *_boxes(camera, how.boxes, rng)), shadows  # a ball lies below what robots hide
+    return (*balls, *by_distance, *_boxes(camera, how.boxes, rng)), shadows  # robots hide balls
 
 
 def _boxes(camera: Camera, count: int, rng: np.random.Generator) -> list[Box]:
-    """What lies flat first, then what stands; one in six is a sheet."""
+    """Boxes, the lowest first; one in six is a flat sheet."""
     boxes = []
     for number, (x, y) in enumerate(_places(camera, count, 0.3, rng) if count else ()):
         length, width, height, turn, *colour = rng.uniform((0.15, 0.15, 0.02, 0.0, 0.02, 0.02, 0.02), _LARGEST_BOX)
@@ -125,7 +124,7 @@ def _boxes(camera: Camera, count: int, rng: np.random.Generator) -> list[Box]:
 
 
 def _places(camera: Camera, count: int, apart_m: float, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Places on the floor that the camera sees, not too near to each other; fewer where there is no room."""
+    """Visible places on the floor, not too near to each other; fewer where there is no room."""
     chosen: list[tuple[float, float]] = []
     pixels = rng.uniform((0.0, 0.0), camera.image_size, size=(_TRIES + 10 * count, 2))
     for x, y in camera.locate(pixels).tolist():
@@ -154,7 +153,7 @@ def _drawn(things: Sequence[Thing], camera: Camera) -> tuple[Image8, Image8]:
 
 
 def _light(camera: Camera, shadows: Sequence[Shadow], how: Photography, rng: np.random.Generator) -> Array32:
-    """(height, width) light that reaches each pixel, 1 in the middle of an evenly lit image."""
+    """(height, width) light at each pixel, 1 at the centre of an evenly lit image."""
     width, height = camera.image_size
     y, x = np.mgrid[0:height:_LIGHT_STEP, 0:width:_LIGHT_STEP].astype(np.float32)
     radius = np.hypot(x - camera.principal_point[0], y - camera.principal_point[1]) / camera.corner_radius
@@ -196,7 +195,7 @@ def _reflected(
     how: Photography,
     rng: np.random.Generator,
 ) -> Array32:
-    """(height, width, 3) share of the light that comes from each pixel, through the lens.
+    """(height, width, 3) reflected share of the light at each pixel, after the lens.
 
     Args:
         drawn: the things' colours and cover, see `_drawn`.
@@ -229,7 +228,7 @@ def _blurred(plane: Array32, sigma: float) -> Array32:
 
 
 def _noise(shape: Sequence[int], rng: np.random.Generator, scale_px: float) -> Array32:
-    """Random numbers of standard deviation 1 that are alike over about `scale_px`."""
+    """Random numbers with standard deviation 1 that are correlated over about `scale_px`."""
     small = [int(np.ceil(size / scale_px)) + 3 for size in shape[:2]]
     rough = rng.standard_normal(small, dtype=np.float32)
     fine = cv2.resize(rough, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
@@ -237,7 +236,7 @@ def _noise(shape: Sequence[int], rng: np.random.Generator, scale_px: float) -> A
 
 
 def _worn(shape: Sequence[int], share: float, rng: np.random.Generator) -> Array32:
-    """1 where the paint is gone, on a canvas: small patches, more of them in some places than in others."""
+    """1 where the paint is worn off, on a canvas: small patches, denser in some places than in others."""
     fine = _noise(shape, rng, _WEAR_PATCH_PX * render.SUBPIXELS)
     level = fine + 0.5 * _noise(shape, rng, _BLOTCH_PX * render.SUBPIXELS)
     limit = float(np.quantile(level[::7, ::7], 1.0 - share))
@@ -265,7 +264,7 @@ def _exposed(light: Array32, reflected: Array32, how: Photography, rng: np.rando
 
 
 def _smeared(signal: Array32, length_px: float, rng: np.random.Generator) -> Array32:
-    """As a camera that moves evenly, anywhere across, while the shutter is open takes it."""
+    """The image of a camera that moves uniformly, in a random direction, during the exposure."""
     direction, size = rng.uniform(0.0, np.pi), 2 * int(np.ceil(0.5 * length_px)) + 1
     fine = np.zeros((size * _FINE, size * _FINE), np.float32)
     end = 0.5 * length_px * _FINE * np.array([np.cos(direction), np.sin(direction)])

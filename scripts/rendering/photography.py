@@ -1,4 +1,4 @@
-"""How a photograph of a scene is taken: light, carpet, paint, what stands about, lens blur and sensor."""
+"""How a photograph of a scene is taken: light, carpet, paint, things, lens blur and sensor."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ MOST_THINGS = 100
 
 @dataclass(frozen=True)
 class Photography:
-    """What a photograph shows besides the targets, and what the camera makes of it.
+    """What a photograph shows in addition to the targets, and the properties of lens and sensor.
 
     Attributes:
-        blur_px: standard deviation of the lens's Gaussian point spread (defocus), besides the pixel's own square.
+        blur_px: standard deviation of the lens's Gaussian point spread (defocus), in addition to the pixel's square.
         vignetting: share of the light that is lost in the farthest image corner.
         unevenness: share by which the lamps' light varies over the image.
         shadows: number of people's shadows on the floor. shadow_depth: share of the light that each takes.
         robots: number of robots on the field, balls: number of balls; both hide what is behind them.
-        boxes: number of boxes, mats and people, who hide a part of the field.
+        boxes: number of boxes, mats and people that hide a part of the field.
         wear: share of the paint that is worn off.
         carpet: brightness of the carpet, paint: of paint and paper, as shares of white.
         carpet_colour, paint_colour: blue, green and red of each, times its brightness.
-        sun: light of the sun, times the lamps', in stripes as windows let it in.
-        strips: share by which strips of carpet, which meet in seams, differ in brightness.
-        glare: share of white that a lamp mirrored by the floor adds where it is brightest.
+        sun: light of the sun in stripes, as through windows, times that of the lamps.
+        strips: share by which strips of carpet, with seams between them, differ in brightness.
+        glare: share of white that the floor's reflection of a lamp adds at its brightest place.
         carpet_texture: standard deviation of the carpet's brightness, as a share of it.
         exposure: grey level of white in full light.
         read_noise: standard deviation of the sensor's noise in the dark, grey levels.
         shot_noise: variance that each grey level of signal adds, in grey levels squared (photon noise).
-        mosaic: whether each of the sensor's pixels sees one colour (red and green in every other row, green and blue in
-            the others), the other two filled in from those around.
-        motion_px: way of the camera while the shutter is open.
+        mosaic: whether each pixel of the sensor sees one colour (red and green in every other row, green and blue in
+            the others), with the other two interpolated.
+        motion_px: length of the camera's motion during the exposure.
         jpeg_quality: 1 to 100; 0: no compression.
 
     Raises:
@@ -82,10 +82,10 @@ class Photography:
 
 
 def photography_of(scene: Scene) -> Photography:
-    """As the scene says it.
+    """The photography that a scene defines.
 
     Raises:
-        InputError: it says something that photographs have not, or a number that cannot be.
+        InputError: an unknown property, or a number out of its range.
     """
     known = [field.name for field in fields(Photography)]
     for name in scene.photography:
@@ -95,5 +95,5 @@ def photography_of(scene: Scene) -> Photography:
 
 
 def taken_as(scene: Scene, how: Photography) -> Scene:
-    """The scene with how photographs of it are taken."""
+    """The scene with this photography."""
     return replace(scene, photography=vars(how).copy())

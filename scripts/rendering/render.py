@@ -1,8 +1,8 @@
 """From a target to its picture: how much of each pixel is paint, or paper, through any lens.
 
-Every pixel is divided into SUBPIXELS x SUBPIXELS squares, and each of these is filled by the share of it that lies
-inside the paint (a strip of straight or circular border, within the square a straight one). Nothing is thresholded, so
-the picture's lines lie where the model says to some thousandths of a pixel.
+Every pixel is divided into SUBPIXELS x SUBPIXELS squares. Each square is filled by its share inside the paint, whose
+border is taken as straight within the square. Nothing is thresholded, so that the lines of the picture agree with the
+model to some thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ceres_cal.scene.targets.target import Paper
 from rendering.paper import Footprints, dark_share, share_inside
 
 Canvas = Array32
-"""(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""
+"""(height, width) times SUBPIXELS: the share of paint in each small square, or the brightness of paper there."""
 
 SUBPIXELS = 3
-SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
+SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 INK, PAPER = 0.06, 0.9
-_PIECES = 400  # of a curve, when the pixels near it are looked for
+_PIECES = 400  # of a curve, in the search for the pixels near it
 _STEPS = (np.arange(SUBPIXELS) - 0.5 * (SUBPIXELS - 1)) / SUBPIXELS
 _BLOCK = 1 << 16
 
@@ -45,12 +45,12 @@ def blank_canvas(image_size: tuple[int, int]) -> Canvas:
 
 
 def on_canvas(pixels: Array) -> Array:
-    """Pixel coordinates (N, 2) as those of the canvas, (0, 0) being the middle of its first square."""
+    """Pixel coordinates (N, 2) as coordinates of the canvas, where (0, 0) is the centre of its first square."""
     return np.asarray((pixels + 0.5) * SUBPIXELS - 0.5)
 
 
 def averaged(canvas: Canvas | Image8) -> Array32:
-    """A canvas (or a stack of them along the last axis) as an image: what falls on each square pixel."""
+    """A canvas (or a stack of them along the last axis) as an image: the mean over each pixel."""
     size = canvas.shape[1] // SUBPIXELS, canvas.shape[0] // SUBPIXELS
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
@@ -59,9 +59,9 @@ def averaged(canvas: Canvas | Image8) -> Array32:
 
 
 def paint_curves(canvas: Canvas, target: Target, camera: Camera) -> None:
-    """Paint a target's curves of a width above 0 onto a canvas.
+    """Paint a target's curves with a width above 0 onto a canvas.
 
-    A segment's paint ends half a width past its ends, so that lines which meet in a corner fill it.
+    The paint of a segment ends half a width beyond its ends, so that lines that meet in a corner fill it.
 
     Args:
         camera: its cam_from_world is cam_from_target.
@@ -73,12 +73,12 @@ def paint_curves(canvas: Canvas, target: Target, camera: Camera) -> None:
         for squares in _squares(_near(curve, camera), camera, height_m):
             share = _strip(curve, squares)
             there = squares.rows, squares.columns
-            # Where strips overlap their borders are one line or cross: the larger share is the union's.
+            # Overlapping strips share a border or cross, so the larger share is that of their union.
             canvas[there] = np.maximum(canvas[there], share)
 
 
 def _near(curve: Curve, camera: Camera) -> Image8:
-    """The pixels that a curve's paint may touch, as a mask (height, width)."""
+    """The pixels that a curve's paint may cover, as a mask (height, width)."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
     left, middle, right = (camera.project(curve_points(curve, side, _PIECES)) for side in (1, 0, -1))
@@ -94,7 +94,7 @@ def _near(curve: Curve, camera: Camera) -> Image8:
 
 
 def _squares(mask: Image8, camera: Camera, height_m: float) -> Iterator[_Squares]:
-    """The small squares of a mask's pixels on the plane z = height_m, some at a time."""
+    """The small squares of a mask's pixels on the plane z = height_m, in blocks."""
     y, x = np.nonzero(mask)
     for first in range(0, len(x), _BLOCK):
         block = slice(first, first + _BLOCK)
@@ -109,7 +109,7 @@ def _squares(mask: Image8, camera: Camera, height_m: float) -> Iterator[_Squares
 
 
 def _divided(pixels: Indices, middle: Array, along_x: Array, along_y: Array) -> _Squares:
-    """Pixels and their footprints, divided: within half a pixel the lens's map is straight to 1e-4 px."""
+    """Pixels and their footprints, divided; within half a pixel the lens's map is linear to 1e-4 px."""
     j, i = (index.ravel() for index in np.indices((SUBPIXELS, SUBPIXELS)))
     place = middle[:, None] + _STEPS[i][:, None] * along_x[:, None] + _STEPS[j][:, None] * along_y[:, None]
     times = len(i)
@@ -165,7 +165,7 @@ def sheet_outline(paper: Paper) -> Array:
 
 
 def print_sheet(canvas: Canvas, target: Target, camera: Camera) -> Image8:
-    """Print a target's sheet onto a canvas, and the mask (height, width) of the pixels it covers."""
+    """Print a target's sheet onto a canvas; returns the mask (height, width) of the pixels it covers."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
     assert target.paper is not None

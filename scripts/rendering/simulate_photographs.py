@@ -1,7 +1,7 @@
 """Observations of a simulated scene, and photographs of it: SCENE -o DIR [--images png|jpg] [--seed N]
 
-As `ceres-cal simulate` makes observations.json and truth.json, and photographs/ beside them; what robots and balls hide
-there is not observed.
+Like `ceres-cal simulate` it writes observations.json and truth.json, and also photographs/. Observations that robots
+and balls hide in the photographs are left out.
 """
 
 from __future__ import annotations

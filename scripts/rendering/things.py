@@ -1,4 +1,4 @@
-"""What stands on the field: robots with coloured covers, balls, and people whose shadows fall on the floor."""
+"""Things on the field: robots with coloured covers, balls, boxes, and people's shadows on the floor."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _CIRCLE = np.column_stack([np.cos(_TURN), np.sin(_TURN)])
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot at (x, y) m: a cylinder whose cover bears a team's disc and four markers; `pattern` chooses them."""
+    """A robot at (x, y) m: a cylinder whose cover has a team's disc and four markers, chosen by `pattern`."""
 
     x_m: float
     y_m: float
@@ -37,7 +37,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball that lies at (x, y) m."""
+    """A ball on the floor at (x, y) m."""
 
     x_m: float
     y_m: float
@@ -45,7 +45,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Box:
-    """A box, a mat or somebody who stands around (x, y) m: half sides, height and turn, and the colour of its top."""
+    """A box, a mat or a person at (x, y) m: half sides, height and heading, and the colour of its top."""
 
     x_m: float
     y_m: float
@@ -113,7 +113,7 @@ def shadow_outline(shadow: Shadow, camera: Camera) -> Array:
 
 
 def _level(box: Box, height_m: float, camera: Camera) -> Array:
-    """Its border at a height; sides in steps, as a lens bends them."""
+    """The border of a box at a height; its sides are sampled, since a lens bends them."""
     steps = np.linspace(-1.0, 1.0, 12, endpoint=False)
     ones = np.ones(len(steps))
     sides = [(steps, -ones), (ones, steps), (-steps, ones), (-ones, -steps)]
@@ -129,7 +129,7 @@ def _disc(middle: Array, radius_m: float, camera: Camera) -> Array:
 
 
 def _ball_horizon(ball: Ball, position: Array) -> Array:
-    """(N, 3) m: the circle on a ball where lines of sight touch it."""
+    """(N, 3) m: the circle on a ball where lines of sight are tangent."""
     middle = np.array([ball.x_m, ball.y_m, BALL_RADIUS_M])
     away = position - middle
     distance = float(np.linalg.norm(away))
@@ -142,7 +142,7 @@ def _ball_horizon(ball: Ball, position: Array) -> Array:
 
 
 def _convex(points: Array) -> Array:
-    """The corners of the convex hull of points (N, 2), in order; NaN goes through."""
+    """The corners of the convex hull of points (N, 2), in order; NaN if a point is NaN."""
     if not np.all(np.isfinite(points)):
         return np.full((1, 2), np.nan)
     ordered = points[np.lexsort((points[:, 1], points[:, 0]))]
