@@ -59,8 +59,9 @@ def test_circles_are_found_and_their_centres_right(board: Target, tilt: float, t
     assert shown
     nearest = [np.min(np.linalg.norm(truth - one, axis=1)) for one in peer.reshape(-1, 2)]
     ours, theirs = (float(np.sqrt(np.mean(np.square(off)))) for off in (np.linalg.norm(error, axis=1), nearest))
-    assert ours < 0.08  # 0.05
-    assert ours < (0.4 if tilt > 0.3 else 0.9) * theirs  # 0.18 tilted, 0.07 else
+    # 0.015; a homography alone is 0.05 off, as the lens moves the middles, too: phi was 7 standard deviations off.
+    assert ours < 0.025
+    assert ours < (0.15 if tilt > 0.3 else 0.4) * theirs  # 0.18 tilted, 0.07 else
 
 
 def test_a_description_comes_back() -> None:

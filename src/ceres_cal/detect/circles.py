@@ -1,8 +1,8 @@
-"""Grids of circles in images: OpenCV finds them, and its ellipse middles are corrected to the circles' centres.
+"""Grids of circles in images: OpenCV finds them, and the middles that it measures are corrected to the centres.
 
-The middle of an ellipse is not the image of its circle's centre: perspective moves it towards the nearer side, by some
-hundredths of a pixel, or by some tenths where circles are large and tilted. The homography of the whole grid says by
-how much.
+The middle of a circle's picture is not the picture of its centre: perspective moves it towards the nearer side and the
+distortion of a lens along the radius, by some hundredths of a pixel, or by some tenths where circles are large. A
+smooth picture of the whole grid says by how much.
 """
 
 from __future__ import annotations
@@ -11,7 +11,11 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Image8
+from ceres_cal.detect.scatter import smooth_picture
 from ceres_cal.scene.targets import Target
+
+_ANGLES = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+_RIM = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 def measured_circles(image: Image8, board: Target) -> Array | str:
@@ -37,16 +41,19 @@ def _is_mirrored(grid: Array) -> bool:
 
 
 def _centres(grid: Array, places: Array, radius_m: float) -> Array:
-    """Return the images of the circles' centres, given the middles of their ellipses (rows, columns, 2) px."""
+    """Return the images of the circles' centres, given the middles of their pictures (rows, columns, 2) px."""
     middles = grid.reshape(-1, 2)
-    homography, _ = cv2.findHomography(places, middles)
-    if homography is None:
+    picture = smooth_picture(places, middles)
+    if picture is None:
         return grid
-    inverse = np.linalg.inv(homography)
-    shifts = []
-    for x, y in places:
-        circle = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [-x, -y, x * x + y * y - radius_m**2]])
-        conic = inverse.T @ circle @ inverse
-        centre = homography @ (x, y, 1.0)
-        shifts.append(np.linalg.solve(conic[:2, :2], -conic[:2, 2]) - centre[:2] / centre[2])
-    return np.asarray((middles - np.array(shifts)).reshape(grid.shape))
+    rims = picture((places[:, None] + radius_m * _RIM).reshape(-1, 2)).reshape(len(places), -1, 2)
+    centres = picture(places)
+    return np.asarray((middles - _middles(rims - centres[:, None])).reshape(grid.shape))
+
+
+def _middles(outlines: Array) -> Array:
+    """Return the centroids (N, 2) of polygons (N, corners, 2)."""
+    x, y = np.moveaxis(outlines, -1, 0)
+    after = np.roll(outlines, -1, axis=1)
+    double = x * after[..., 1] - y * after[..., 0]
+    return np.asarray(np.sum((outlines + after) * double[..., None], axis=1) / (3.0 * double.sum(axis=1)[:, None]))

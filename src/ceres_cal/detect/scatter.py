@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -36,16 +37,51 @@ def scatter_px(grids: Iterable[Array], places: Array) -> float:
 
 def _of_board(grid: Array, board: Array) -> float | None:
     seen = ~np.isnan(grid[..., 0])
-    pixels, places = grid[seen], board[seen]
+    picture = smooth_picture(board[seen], grid[seen])
+    # The homography has used some of the equations, too.
+    if picture is None or picture.degree < 2 or picture.spare < _FEWEST_SPARE:
+        return None
+    return float(np.sqrt(np.sum((grid[seen] - picture(board[seen])) ** 2) / picture.spare))
+
+
+@dataclass(frozen=True)
+class SmoothPicture:
+    """A map from places on a board to pixels: a homography, and a polynomial of the places.
+
+    Attributes:
+        degree: of the polynomial.
+        spare: degrees of freedom left.
+    """
+
+    homography: Array
+    middle: Array
+    size: float
+    degree: int
+    coefficients: Array
+    spare: int
+
+    def __call__(self, places: Array) -> Array:
+        """Return the pixels (N, 2) of places (N, 2) on the board."""
+        flat = cv2.perspectiveTransform(places[None], self.homography)[0]
+        terms = _terms((places - self.middle) / self.size, self.degree)
+        return np.asarray(flat + terms @ self.coefficients)
+
+
+def smooth_picture(places: Array, pixels: Array) -> SmoothPicture | None:
+    """Fit a smooth map to places (N, 2) on a board and their pixels (N, 2); None where they have no homography."""
     homography, _ = cv2.findHomography(places, pixels)
     if homography is None:
         return None
+    middle, size = places.mean(axis=0), float(np.ptp(places, axis=0).max())
+    degree = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= 2.0 * _SHARE * len(places))
+    terms = _terms((places - middle) / size, degree)
     flat = cv2.perspectiveTransform(places[None], homography)[0]
-    x, y = (places - places.mean(axis=0)).T / np.ptp(board, axis=(0, 1)).max()
-    degrees = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= 2.0 * _SHARE * len(places))
-    terms = np.column_stack([x**i * y**j for i in range(degrees + 1) for j in range(degrees + 1 - i)])
-    solved, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)
-    spare = 2 * (len(places) - rank)
-    if degrees < 2 or spare < _FEWEST_SPARE:  # the homography has used some of the equations, too
-        return None
-    return float(np.sqrt(np.sum((pixels - flat - terms @ solved) ** 2) / spare))
+    coefficients, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)
+    return SmoothPicture(
+        np.asarray(homography, dtype=float), middle, size, degree, coefficients, 2 * (len(places) - int(rank))
+    )
+
+
+def _terms(places: Array, degree: int) -> Array:
+    x, y = places.T
+    return np.column_stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)])
