@@ -1,4 +1,4 @@
-"""A real Chromium, driven over its devtools pipe: what the report's tests look through."""
+"""A real Chromium, controlled through its devtools pipe, for the tests of the report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from data.make_report_picture import chromium
 
 
 def chromium_path() -> str:
-    """The program; skips the test where there is none."""
+    """Path of the program; skips the test where there is none."""
     found = chromium()
     if found is None:
         pytest.skip("no chromium here (Debian, Ubuntu: apt install chromium)")
@@ -27,7 +27,7 @@ def chromium_path() -> str:
 
 
 class Browser:
-    """One window of a Chromium. Messages go over file descriptors 3 and 4, each ended by a zero byte."""
+    """One window of a Chromium. Messages are sent over file descriptors 3 and 4, each terminated by a zero byte."""
 
     def __init__(self, program: str) -> None:
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
@@ -102,7 +102,7 @@ class Browser:
         return answer["result"].get("value")
 
     def wait_for(self, condition: str, seconds: float = 300.0) -> None:
-        """Until an expression in the page is true."""
+        """Waits until an expression in the page is true."""
         end = time.monotonic() + seconds
         while not self.run(f"Boolean({condition})"):
             assert time.monotonic() < end, f"{condition} did not come true; {self.complaints}"
@@ -118,13 +118,13 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key, **{n: v for n, v in more.items() if n != "text"})
 
     def kill(self) -> None:
-        """As a crash or a user would."""
+        """Ends the process as a crash would."""
         self._process.kill()
         self._process.wait()
 
     @property
     def complaints(self) -> list[str]:
-        """What the console said, and requests that left the page."""
+        """Messages of the console, and requests that left the page."""
         loud = {"Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded", "Network.loadingFailed"}
         return [json.dumps(event) for event in self.events if event["method"] in loud]
 
@@ -140,7 +140,7 @@ class Browser:
         file.write_bytes(base64.b64decode(picture["data"]))
 
     def print_pdf(self, file: Path) -> None:
-        """As it comes out of a printer on A4."""
+        """The page as printed on A4."""
         answer = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
         file.write_bytes(base64.b64decode(answer["data"]))
 

@@ -1,4 +1,4 @@
-"""What several test modules share. Nothing is imported before it is needed: most modules ask for little of it."""
+"""Shared parts of several test modules. Imports are delayed, since most modules need few of them."""
 
 from __future__ import annotations
 
@@ -19,35 +19,37 @@ if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
     from ceres_cal.detect.photographs import FieldDetections
 
-# Hypothesis' profile for it: the same examples every time, and no deadline. Its option would import it for all modules.
+# This selects Hypothesis' profile for CI: the same examples every time, and no deadline. Its option would import it.
 os.environ["CI"] = "true"
 
 _T = TypeVar("_T")
 
-# A shell's background jobs get SIGINT ignored, and hand it on; the tests of Ctrl-C want it as it comes at a terminal.
+# A shell's background jobs ignore SIGINT, and so do their children; the tests of Ctrl-C need Python's default handler.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-if sys.dont_write_bytecode:  # a suite's many processes compile what they import once, beside pytest's own cache
+if sys.dont_write_bytecode:  # compiled modules are shared by all processes, beside pytest's cache
     sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
     os.environ |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": sys.pycache_prefix}
 
 
 def pytest_collection() -> None:
-    """All that is imported and collected stays: nobody needs to look through it for garbage."""
+    """Imported and collected objects stay, so that the garbage collector need not search them."""
     gc.disable()
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     gc.freeze()
     gc.enable()
-    if "hypothesis" not in sys.modules:  # which its plugin would import at the end all the same
+    if "hypothesis" not in sys.modules:  # its plugin would import it at the end
         session.config.pluginmanager.unregister(name="hypothesispytest")
 
 
 @pytest.fixture(autouse=True)
 def _signals_kept() -> Iterator[None]:
-    """Whatever a test runs, signals go where they went: the next one's processes inherit what is ignored."""
+    """After each test the signal handlers are unchanged, since the processes of the next test
+    inherit ignored signals.
+    """
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     yield
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
@@ -65,7 +67,7 @@ def real_data() -> Path:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[], _T]) -> _T:
-    """What takes long to make: the first of the run's workers makes it, and the others read it."""
+    """An object that takes long to make: the first worker of the run makes it, and the others read it."""
     own = factory.getbasetemp()
     path = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / name
     with path.with_suffix(".lock").open("w") as lock:
@@ -78,7 +80,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[], _T]
 
 @pytest.fixture
 def as_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """What a script prints, run in a folder, with arguments; in this process, which has imported all that it needs."""
+    """The output of a script, run in a folder with arguments, in this process, which has its imports already."""
 
     def run(script: Path, *arguments: object, folder: Path) -> str:
         monkeypatch.chdir(folder)
@@ -92,7 +94,7 @@ def as_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
 
 @pytest.fixture
 def words_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without their pictures, which take most of the time, for tests that ask what is said."""
+    """Reports without pictures, which take most of the time, for tests of their text."""
     monkeypatch.setattr("ceres_cal.report.page.to_svg", lambda *_: "<svg></svg>")
 
 
@@ -107,13 +109,13 @@ def _boards(
 
 @pytest.fixture(scope="session")
 def sony_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
-    """What is detected in BoofCV's 13 photographs."""
+    """The boards that are detected in BoofCV's 13 photographs."""
     return _boards(tmp_path_factory, "sony", real_data / "boofcv_sony_chess", "*.jpg", (4, 6, 0.03))
 
 
 @pytest.fixture(scope="session")
 def tigers_field(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FieldDetections]:
-    """A real photograph of a field, and what is detected in it."""
+    """A real photograph of a field, and the lines detected in it."""
     from photos.shots import real_detection
 
     return made_once(tmp_path_factory, "tigers", lambda: real_detection(real_data))
@@ -121,14 +123,14 @@ def tigers_field(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> t
 
 @pytest.fixture(scope="session")
 def gopro_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
-    """What is detected in the 36 wide-angle photographs; the size of a square is not known."""
+    """The boards that are detected in the 36 wide-angle photographs; the size of a square is unknown."""
     return _boards(tmp_path_factory, "gopro", real_data / "udacity_gopro_wide", "GOPR*.jpg", (8, 6, 1.0))
 
 
 @pytest.fixture(scope="session")
 def files_of_a_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder to copy: a calibration (old.json), observations from before (same.json) and after a move (after.json),
-    and such that nothing explains (mirrored.json).
+    and observations that nothing explains (mirrored.json).
     """
     from accuracy.moves import DAY, HOME, MOVED, calibrated, seen
 

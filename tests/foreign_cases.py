@@ -1,4 +1,4 @@
-"""Calibrations to hand to the formats of others: every lens over a field, and places that their cameras show."""
+"""Calibrations for exports to other formats: every lens above a field, and places that their cameras show."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ _POSES = (overhead_pose(-0.5, -1.2, 5.2, -14.0, -11.5, 4.0), overhead_pose(0.9, 
 
 
 def with_lens(lens: str | Lens, aspect: float = 1.0, number: int = 0) -> Camera:
-    """A camera of `scenes` over its field; the second one has another phi and another place."""
+    """A camera of `scenes` above its field; the second one has another phi and another pose."""
     one = camera(lens) if isinstance(lens, str) else replace(camera("brown"), lens=lens)
     return replace(one, phi=one.phi * (1.0 + 0.013 * number), aspect=aspect).at(_POSES[number])
 
 
 def over_field(camera: Camera, name: str = "overhead") -> Calibration:
-    """The calibration of one camera over a division B field."""
+    """The calibration of one camera above a division B field."""
     return calibration_of("a test", {name: camera}, {"field": ssl_field("B")})
 
 
 def two_cameras(lens: str | Lens) -> Calibration:
-    """Of two, named so that they keep their ids."""
+    """A calibration of two cameras, whose names keep their ids."""
     cameras = {f"camera{number}": with_lens(lens, number=number) for number in (0, 1)}
     return calibration_of("a test", cameras, {"field": ssl_field("B")})
 
 
 def places(camera: Camera, count: int = 1000, margin_px: float = 0.0) -> tuple[Array, Array]:
-    """Points (N, 3) m that the camera shows, on the floor and above it, and where, px."""
+    """Points (N, 3) m that the camera shows, on the floor and above it, and their pixels."""
     draw = np.random.default_rng(5)
     size = np.array(camera.image_size)
     pixels = draw.uniform(margin_px - 0.5, size - 0.5 - margin_px, (count, 2))
@@ -49,7 +49,7 @@ def places(camera: Camera, count: int = 1000, margin_px: float = 0.0) -> tuple[A
 
 
 def same_camera(one: Camera, other: Camera, tolerance: float = 1e-12) -> bool:
-    """Whether all numbers agree, but for rounding."""
+    """Whether all numbers agree up to rounding."""
     if one.image_size != other.image_size or one.lens.names != other.lens.names:
         return False
     first, second = (

@@ -1,4 +1,4 @@
-"""The maps of the lenses that are compiled, as one reads them: what the kernels are compared with."""
+"""The maps of the compiled lenses in plain Python, with which the kernels are compared."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _of_spline(lens: Spline, rays: Array, phi: float) -> Array:
 
 
 def displacements(lens: Lens, places: Array) -> Array:
-    """(N, 2) px by which a surface displaces places (N, 2), in rims: cubic B-splines, the same beyond the grid."""
+    """(N, 2) px by which a surface displaces places (N, 2), in rims: cubic B-splines, constant beyond the grid."""
     known = lens.coefficients
     weights = []
     for side, count, place in zip(EXTENTS, (COLUMNS, ROWS), places.T, strict=True):

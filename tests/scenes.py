@@ -1,4 +1,4 @@
-"""Scenes whose truth is known: every lens before every mix of targets, each enough to determine its camera."""
+"""Scenes with known truth: every lens with every mix of targets, each of which determines its camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ceres_cal.scene.lens.spline import COLUMNS, ROWS
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import Scene, Station
 
-# phi, lens, and the height (m) from which the image just holds a division B field.
+# phi, lens, and the height (m) from which the image just contains a division B field.
 _LENSES: dict[str, tuple[float, Lens, float]] = {
     "radial-2-3": (868.0, Radial((-5.2e-5, 6.1e-7), (2, 3)), 5.2),
     "radial-3": (840.0, Radial((6.0e-7,), (3,)), 5.2),
@@ -47,10 +47,10 @@ _MORE: dict[str, tuple[float, Lens, float]] = {
     "spline-surface": (825.0, Spline(_SURFACE, (2, 3), ("surface",)), 5.2),
 }
 EVERY_LENS = tuple(name for name in (*_LENSES, *_MORE) if name != "spline-surface")
-"""Also with terms that a lens has only where they are asked for, but for a surface: most of its nodes show nowhere."""
+"""With all optional terms of a lens, except a surface, most of whose nodes are not observed."""
 
 RADIAL = Options(lens="radial", usual_camera=False)
-"""The paper's lens and nothing but what is stated, of tests that do not ask which lens it is."""
+"""The paper's lens without further priors, for tests that do not depend on the lens."""
 
 _SPACING_M = 0.2
 _LINES = tuple(name for name in ssl_field("B").curve_names if name != "CenterCircle")
@@ -68,19 +68,19 @@ def _height_m(lens: str) -> float:
 
 
 def _leaning(lens: str) -> tuple[dict[str, Camera], dict[str, Station]]:
-    """One station over the field, tilted by 18 degrees."""
+    """One station above the field, tilted by 18 degrees."""
     pose = overhead_pose(-0.5, -1.2, _height_m(lens), tilt_x_deg=-14.0, tilt_y_deg=-11.5, yaw_deg=4.0)
     return {"overhead": camera(lens)}, {"overhead": Station("overhead", pose)}
 
 
 def _upright(lens: str) -> tuple[dict[str, Camera], dict[str, Station]]:
-    """One station over the field, tilted by 1 degree: the field alone cannot tell phi."""
+    """One station above the field, tilted by 1 degree: the field alone does not determine phi."""
     pose = overhead_pose(0.1, 0.2, _height_m(lens), tilt_x_deg=0.8, tilt_y_deg=-0.6, yaw_deg=-2.0)
     return {"overhead": camera(lens)}, {"overhead": Station("overhead", pose)}
 
 
 def side_by_side(left: Camera) -> tuple[dict[str, Camera], dict[str, Station]]:
-    """Two cameras of nearly the same phi, each over its half of the field."""
+    """Two cameras with nearly the same phi, each above its half of the field."""
     stations = {
         "left": Station("left", overhead_pose(-2.3, 0.05, 4.4, 4.0, 2.0, 90.0)),
         "right": Station("right", overhead_pose(2.35, -0.08, 4.5, 5.0, -2.5, -90.8)),
@@ -99,13 +99,13 @@ def lines(lens: str) -> Scene:
 
 
 def lines_and_arcs(lens: str) -> Scene:
-    """The lines and the centre circle; their left edges, not the middle of the paint."""
+    """The lines and the centre circle; their left edges instead of the middle of the paint."""
     scene = field_scene(ssl_field("B"), *_leaning(lens), points=(), spacing_m=_SPACING_M)
     return replace(scene, views=tuple(replace(plan, side="left") for plan in scene.views))
 
 
 def boards(lens: str) -> Scene:
-    """Checkerboards at several tilts before one static camera; nothing shows the world."""
+    """Checkerboards at several tilts in front of one static camera; nothing shows the world."""
     stations = {"camera": Station("camera", Pose.identity())}
     return board_scene(_BOARD, {"camera": camera(lens)}, stations, count=8, seed=11)
 
@@ -149,7 +149,7 @@ def poles(lens: str) -> Scene:
 
 
 def two_cameras(lens: str) -> Scene:
-    """Two cameras over one field, and boards that both see at once."""
+    """Two cameras above one field, and boards that both see at the same time."""
     west = camera(lens)
     east = replace(west, phi=west.phi * 1.013, principal_point=(633.2, 487.5))
     height = _height_m(lens)
@@ -164,7 +164,7 @@ def two_cameras(lens: str) -> Scene:
 
 
 def several_stations(lens: str) -> Scene:
-    """One camera that was moved twice over one field."""
+    """One camera at three stations above one field."""
     height = _height_m(lens)
     stations = {
         "first": Station("overhead", overhead_pose(0.3, -0.1, height, tilt_x_deg=1.0, tilt_y_deg=2.0)),
@@ -175,7 +175,7 @@ def several_stations(lens: str) -> Scene:
 
 
 def field_and_boards(lens: str) -> Scene:
-    """The field from straight above, and the boards that tell phi."""
+    """The field from straight above, and boards that determine phi."""
     cameras, stations = _upright(lens)
     field = field_scene(ssl_field("B"), cameras, stations, frames=2, spacing_m=_SPACING_M)
     return join(field, board_scene(_BOARD, cameras, stations, count=6, seed=13))

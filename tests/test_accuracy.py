@@ -1,8 +1,8 @@
-"""The statistical limit, by small samples: efficiency, bias, outliers, mirrored poses, ssl-vision's table, as built.
+"""The statistical limit with small samples: efficiency, bias, outliers, mirrored poses, ssl-vision, field as built.
 
-`scripts/accuracy/accuracy.py` has the full samples. Here each calibration is compared with the best one that its own
-noise allows (known truth, sigmas and outliers), so that few runs tell a few percent; the best itself keeps to the
-Cramer-Rao bound.
+`scripts/accuracy/accuracy.py` has the full samples. Here each calibration is compared with the best one for its own
+noise (known truth, sigmas and outliers), so that few runs are enough to test a few percent. The best one itself is
+compared with the Cramer-Rao bound.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from ceres_cal.problem.structure import Tolerance
 from ceres_cal.robust.other_minima import mirrored
 from ceres_cal.simulate import simulate
 
-RUNS = dict.fromkeys(scenes.PROBLEMS, 20) | {"two cameras": 8}  # which have 58 numbers each
+RUNS = dict.fromkeys(scenes.PROBLEMS, 20) | {"two cameras": 8}  # which have 58 numbers
 PROBLEMS = tuple(scenes.PROBLEMS)
 
 
 @cache
 def found(problem: str, outliers: float) -> limit.Efficiency:
     noise = replace(scenes.CLEAN_NOISE, outliers=outliers)
-    runs = min(RUNS[problem], 10) if outliers else RUNS[problem]  # twelve percent are told by fewer
+    runs = min(RUNS[problem], 10) if outliers else RUNS[problem]  # fewer runs are enough for a limit of 12 %
     return limit.efficiency(scenes.PROBLEMS[problem](), noise, range(runs))
 
 
@@ -51,7 +51,7 @@ def test_efficient_without_outliers(name: str) -> None:
     efficiency = found(name, 0.0)
     assert efficiency.failed == 0
     excess, error = efficiency.excess
-    assert error < 0.015  # 0.012 measured at most, so that 5 percent are told
+    assert error < 0.015  # 0.012 measured at most, so that 5 % are significant
     assert excess < 0.05  # 0.006 measured at most
     sigmas, parameter = efficiency.bias
     assert sigmas < 4.0, parameter  # 2.7 measured at most, of 58 numbers
@@ -69,7 +69,7 @@ def test_efficient_with_a_fifth_of_outliers(name: str) -> None:
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.thorough
 def test_the_best_keeps_to_the_bound(name: str) -> None:
-    """So the bound is that of this problem, and the excess over the best is that over the bound."""
+    """The bound is that of this problem, so the excess over the best one is the excess over the bound."""
     squared = np.concatenate([found(name, outliers).best_squared for outliers in (0.0, 0.2)])
     mean, _ = mean_and_error(squared)
     expected_error = np.sqrt(2.0 / (len(found(name, 0.0).keys) * len(squared)))  # of a chi-squared variable
@@ -77,7 +77,9 @@ def test_the_best_keeps_to_the_bound(name: str) -> None:
 
 
 def test_bound_by_differences() -> None:
-    """The information of the field is that of its residuals' differences, none of the package's derivatives in it."""
+    """The information of the field equals that of finite differences of its residuals, without the package's
+    derivatives.
+    """
     problem = scenes.over_the_field()
     trial = limit.make_trial(problem, scenes.CLEAN_NOISE, 0)
     known = limit.bound(trial)
@@ -103,7 +105,7 @@ def test_bound_by_differences() -> None:
 
 @pytest.mark.thorough
 def test_poses_that_a_bad_start_decided_are_tried_again() -> None:
-    """From a start with twice the noise, where phi is 21 px off, six boards seem to have decided for the wrong pose."""
+    """With an initial estimate whose phi is 21 px off, six boards seemed to determine the wrong pose."""
     simulation = simulate(scenes.small_boards(1000, 11), scenes.CLEAN_NOISE, 11)
     calibration = calibrate(simulation.observations, Options(lens="brown"))
     rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
@@ -127,12 +129,12 @@ def test_no_pose_of_a_small_board_is_mirrored() -> None:
     calibration = calibrate(observations, Options(lens="brown"))
     rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
     assert accuracy.mirrored_count(calibration, observations, rotations) == 0
-    # The count is no idle one: it tells poses that are mirrored on purpose.
+    # The count is not trivially 0: it counts poses that are mirrored on purpose.
     sights = gather_sights(observations)
     poses = mirrored(sights, calibration.estimate.pose_stack(sights.keys))
     placements = {str(key.placement): Pose(p[:, :3], p[:, 3]) for key, p in zip(sights.keys, poses, strict=True)}
     turned = replace(calibration, estimate=replace(calibration.estimate, placements=placements))
-    assert accuracy.mirrored_count(turned, observations, rotations) > 100  # 165; others are led back
+    assert accuracy.mirrored_count(turned, observations, rotations) > 100  # 165; the solve corrects the others
 
 
 # ---- ssl-vision's table ---------------------------------------------------------------------------------------------
@@ -143,7 +145,7 @@ def test_the_scenes_of_ssl_vision_are_solved_as_well_as_the_noise_allows(name: s
     rows = list(accuracy.ssl_vision_rows(name, scenes.SSL_PROBLEMS[name](), 6))
     for row in rows:
         if row.what.startswith("its excess"):
-            assert row.error < 0.03  # 0.003 measured, so that 10 percent are told
+            assert row.error < 0.03  # 0.003 measured, so that 10 % are significant
         assert row.verdict in ("yes", "open", ""), row
     # Medians of 6 seeds vary by 15 percent or so; the paper's lens is ssl-vision's worst case.
     means = {row.case: row.value for row in rows if row.what.startswith("mean")}
@@ -153,7 +155,7 @@ def test_the_scenes_of_ssl_vision_are_solved_as_well_as_the_noise_allows(name: s
 
 
 def test_bounds_of_the_issue() -> None:
-    """0.98 and 0.60 mm for the paper's polynomial: the mean over all draws from the covariance."""
+    """0.98 and 0.60 mm for the paper's polynomial: the mean over draws from the covariance."""
     for name, half, expected_mm in (("half, paper's lens", True, 0.98), ("whole, paper's lens", False, 0.60)):
         drawn = accuracy.predicted_mm(scenes.SSL_PROBLEMS[name](), scenes.field_places(half), 0.0)
         assert np.mean(drawn) == pytest.approx(expected_mm, abs=0.03), name  # 0.98 and 0.61 measured
@@ -170,7 +172,7 @@ def test_lines_painted_amiss_are_found_by_six_stations(seed: int) -> None:
     )
     errors = accuracy.offset_errors_mm(calibration, painted.offsets_m, scenes.FIELD)
     assert np.max(np.abs(errors)) < 1.0  # 0.45 measured; sd 0.18
-    assert np.std(list(painted.offsets_m.values())) > 0.004  # it was painted amiss
+    assert np.std(list(painted.offsets_m.values())) > 0.004  # the paint is misplaced
 
 
 @pytest.mark.parametrize("heights_known", partly([False, True], [True]))
@@ -189,13 +191,13 @@ def test_the_script_prints_and_writes_its_rows(tmp_path: Path, capsys: pytest.Ca
     printed = capsys.readouterr().out
     assert {row["verdict"] for row in rows} == {"yes", "open"}
     assert all(row["what"] in printed for row in rows)
-    assert "Infinity" not in path.read_text(encoding="utf-8")  # JSON knows none
+    assert "Infinity" not in path.read_text(encoding="utf-8")  # JSON has no infinity
 
 
 @pytest.mark.parametrize("floor, most", [("flat", 1.1), ("bowed", 1.6), ("out of square", 2.5)])
 def test_a_floor_that_is_off_is_in_the_sd_of_one_picture(floor: str, most: float) -> None:
-    """0.52 and 0.62 of a flat one measured, 0.99 and 0.96 of one that bows, 0.84 and 1.25 out of square; without the
-    prior .9, and 3 to 5.
+    """Measured: 0.52 and 0.62 for a flat floor, 0.99 and 0.96 for a bowed one, 0.84 and 1.25 out of square; without the
+    prior 0.9, and 3 to 5.
     """
     for row in floors.rows(floor, 2):
         assert 0.3 < row.value < most, row

@@ -1,4 +1,4 @@
-"""What advice promises: its information against the observations themselves, its millimetres against what is obtained.
+"""The promises of advice: its information compared with that of observations, its millimetres with those obtained.
 
 `scripts/accuracy/advice.py` has the full samples; here are small ones.
 """
@@ -55,7 +55,7 @@ def observed(name: str, seed: int = 0) -> Observations:
 @cache
 def calibrated(name: str, seed: int = 0) -> Calibration:
     tolerances = {"field": Tolerance(lines_m=0.01)} if name == "as built" else {}
-    # As drawn: else one calibration may solve for a board's points that the next one, with more to see, does not.
+    # As drawn, since otherwise only one of two calibrations may solve for a board's points.
     options = replace(PROBLEMS[name]().options, tolerances=tolerances, as_built="as drawn")
     return calibrate(observed(name, seed), options)
 
@@ -72,7 +72,7 @@ def first_of(advice: Advice) -> Mapping[str, Promise]:
 
 KINDS = {"tape", "pole", "board", "line", "frames"}
 AGAIN = {"line", "frames"}
-"""What the same camera sees of the same field again: what widens what is known of it stays as wide."""
+"""The same camera sees the same field again; effects that widen the covariance stay as wide."""
 
 
 # ---- what a measurement tells ---------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ AGAIN = {"line", "frames"}
 
 @pytest.mark.parametrize("name", partly(["two cameras", "as built", "whole field, 1 deg, 6 boards"], ["as built"]))
 def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
-    """Information about everything, of what was observed and what would be, less that of what was observed."""
+    """Its information equals that of all observations, including the simulated ones, less that of the present ones."""
     calibration, observations = calibrated(name), observed(name)
     weighting = Weighting(0.3, 0.3, "trivial")
     estimate, tolerances = calibration.estimate, calibration.options.tolerances
@@ -121,7 +121,7 @@ def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
 
 @pytest.mark.thorough
 def test_the_best_of_a_pool_tell_together_what_each_tells() -> None:
-    """So the greedy choice adds them up: poles stand, and boards are held, independently."""
+    """The greedy choice adds them up, since poles and boards are independent."""
     ground, _ = _prepared(calibrated("whole field, 3 deg"), None, 0.15)
     for promise in advised("whole field, 3 deg").promises:
         whole = promise.measurement
@@ -146,7 +146,7 @@ def test_the_best_of_a_pool_tell_together_what_each_tells() -> None:
 
 @pytest.mark.parametrize("name", ["whole field, 8 deg", "as built"])
 def test_each_of_many_is_judged_as_it_is_alone(name: str) -> None:
-    """By the few directions that it tells of, and by everything that is then known."""
+    """With the few directions that it measures, compared with all numbers."""
     ground, outlook = _prepared(calibrated(name), None, 0.15)
     first, *others = (ground.information_of(promise.measurement) for promise in advised(name).promises)
     for errors, one in zip(outlook.after_each(first, others), others, strict=True):
@@ -174,7 +174,7 @@ def test_what_the_camera_does_not_see_tells_nothing() -> None:
 
 @pytest.mark.parametrize("name", ["whole field, 8 deg", "whole field, 1 deg, 6 boards", "two cameras"])
 def test_the_noise_is_the_one_that_was_found(name: str) -> None:
-    """0.3 px, out of what a calibration's file has: 4 % off at most is chance, of 137 curve observations."""
+    """0.3 px from the file of a calibration; differences of up to 4 % are chance, for 137 curve observations."""
     weighting = _weighting(calibrated(name).fit, next(iter(calibrated(name).cameras)))
     fit = calibrated(name).fit
     assert weighting.curve_scale == pytest.approx(0.3 * fit.curve_scale, rel=1e-9)
@@ -186,7 +186,7 @@ def test_the_noise_is_the_one_that_was_found(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["whole field, 8 deg", "as built", "two cameras"])
 def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None:
-    """The same by the whole posterior with the information added, nothing integrated out before."""
+    """The same as with the whole posterior plus the information, without integrating anything out first."""
     calibration, advice = calibrated(name), advised(name)
     known, weighting = calibration.uncertainty, _weighting(calibration.fit, next(iter(calibration.cameras)))
     tolerances = calibration.options.tolerances
@@ -204,7 +204,7 @@ def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None
 
 
 def test_what_cannot_be_projected_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the end of a valley along phi, for example; the other measurements are advised all the same."""
+    """For example at the end of a valley along phi; the other measurements are proposed nevertheless."""
 
     def of_tape_alone(problem: Problem, estimate: Estimate) -> ReducedInformation:
         if len(problem.sights):
@@ -228,7 +228,7 @@ def test_what_cannot_be_projected_tells_nothing(monkeypatch: pytest.MonkeyPatch)
     ),
 )
 def test_a_promise_is_kept(name: str) -> None:
-    """Each kind followed once: what the new calibration states, for the phi and at the noise that it finds."""
+    """Each kind is followed once: the new calibration's statement, for the phi and the noise that it finds."""
     scene = PROBLEMS[name]().scene
     calibration = calibrated(name)
     kinds = first_of(advised(name))
@@ -256,7 +256,7 @@ def _noise(calibration: Calibration) -> float:
 
 @pytest.mark.thorough
 def test_the_map_is_off_by_what_was_promised() -> None:
-    """Beyond what is stated: what it is off by in fact, where phi was open before; 5 runs, 32 % of chance."""
+    """The true error, not only the stated one, where phi was open before; 5 runs, 32 % chance."""
     problem, kept = PROBLEMS["whole field, 3 deg"](), FollowUp()
     tape = first_of(advised("whole field, 3 deg"))["tape"].measurement
     for seed in range(5):
@@ -276,7 +276,7 @@ def test_the_map_is_off_by_what_was_promised() -> None:
 
 
 def test_more_of_the_same_averages_out_noise_and_not_what_widens() -> None:
-    """Of two numbers, one observed and the other besides scattered by a floor that every frame shows alike."""
+    """Two numbers: one is observed, the other also varies with a floor that is the same in every frame."""
     keys = (Key("camera", "overhead", "phi", "px"), Key("station", "overhead", "z", "m"))
     noise, widening, stated = np.diag([4.0, 9.0]), np.diag([0.0, 16.0]), Information(keys, np.diag([0.0, 0.01]))
     alone = Information(keys, np.linalg.inv(noise)) + stated
@@ -305,7 +305,7 @@ def test_what_phi_leaves_open_is_promised_from_unknown() -> None:
 
 @pytest.mark.thorough
 def test_a_height_that_the_camera_may_be_below() -> None:
-    """1 degree: it hangs at 2 to 8 m, and may show nothing of what is at 3 m."""
+    """With 1 degree of tilt the height may be 2 to 8 m, so the camera may be below a height of 3 m."""
     calibration = calibrated("whole field, 1 deg")
     high_m = 3.0
     nodes = _prepared(calibration, None, high_m)[1].possible
@@ -344,7 +344,7 @@ def test_the_least_work_that_does(before: float, after: list[float], enough: flo
 
 
 def test_poles_stand_where_they_are_seen_wherever_the_camera_may_be() -> None:
-    """1 degree: phi and height could be anything from half to twice; marked places are preferred."""
+    """With 1 degree of tilt phi and height may be half or twice as large; marked places are preferred."""
     calibration = calibrated("whole field, 1 deg")
     _, outlook = _prepared(calibration, None, 0.15)
     assert len(outlook.possible) >= 5
@@ -358,7 +358,7 @@ def test_poles_stand_where_they_are_seen_wherever_the_camera_may_be() -> None:
 
 
 def test_words_are_what_is_meant() -> None:
-    """Pixels, distances and tilts of the boards, places of the poles, against the placements and targets themselves."""
+    """Pixels, distances and tilts of boards, and places of poles, compared with the placements and targets."""
     calibration = calibrated("half field, 3 deg")
     camera = calibration.station()
     seen = set()
@@ -442,7 +442,7 @@ def test_the_command_says_what_to_do_first(file: str, capsys: pytest.CaptureFixt
 
 
 def test_the_command_for_scripts(file: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same from the file as from the calibration in memory, everything in it."""
+    """From the file the same as from the calibration in memory, with all values."""
     assert main(["advise", file, "--json", "--height-mm", "150"]) == 0
     found, advice = json.loads(capsys.readouterr().out), advised("whole field, 3 deg")
     assert [p["worst_mm"] for p in found["promises"]] == [p.after.worst_mm for p in advice.promises]

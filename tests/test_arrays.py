@@ -1,4 +1,4 @@
-"""arrays: what stands in for functions of NumPy's that import more than they need."""
+"""arrays: replacements for functions of NumPy whose import is slow."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What is not where it is drawn: found by itself, with its sigma, and one finding for a target."""
+"""Targets that differ from their drawing: found by default, with a sigma, and with one finding for each target."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_a_bent_board_is_solved_for() -> None:
 
 
 def test_the_heights_of_corners_are_solved_for() -> None:
-    """Paper that is glued to a board lies in waves, which no few bows are."""
+    """Paper that is glued to a board has waves, which a few bows do not describe."""
     errors = []
     for seed in range(4):
         scene, observations = observed(Board(heights_m=1e-3), seed)
@@ -85,7 +85,9 @@ def test_the_heights_of_corners_are_solved_for() -> None:
 
 
 def test_a_lens_without_a_formula_is_as_smooth_as_the_data_say_of_it_beside_a_board_as_built() -> None:
-    """It was asked how smooth it is as if it had been solved for without that: its numbers were 1 sd off their best."""
+    """Its smoothness was estimated as if the solve had been without it, and its numbers were 1 sd
+    from their optimum.
+    """
     for seed in (0, 2):
         sights, options = gather_sights(observed(Board(points_m=2e-4), seed)[1]), Options(lens="spline", powers=(2, 3))
         start = initialise(sights, options)
@@ -97,7 +99,7 @@ def test_a_lens_without_a_formula_is_as_smooth_as_the_data_say_of_it_beside_a_bo
 
 @pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_what_is_stated_as_it_came_out_moves_nothing(seed: int) -> None:
-    """Corners were solved for beside it with everything else, and took up what the lens leaves."""
+    """The corners were solved for together with everything else, and absorbed residuals of the lens."""
     _, observations = observed(Board(points_m=2e-4, views=5), seed)
     alone = calibrate(observations, BUILT)
     stated = calibrate(
@@ -109,7 +111,7 @@ def test_what_is_stated_as_it_came_out_moves_nothing(seed: int) -> None:
 
 
 def test_a_board_printed_longer_one_way_leaves_its_size_open() -> None:
-    """Its columns stand 0.5 % farther apart: the baseline was off by 7 of its standard deviations."""
+    """Its columns are 0.5 % farther apart. The baseline had an error of 7 of its standard deviations."""
     cameras = {"left": CAMERAS["camera"], "right": CAMERAS["camera"]}
     baseline = Pose(np.eye(3), np.array([-0.12, 0.0, 0.0]))
     stations = {"left": Station("left", Pose.identity()), "right": Station("right", baseline)}
@@ -126,8 +128,8 @@ def test_a_board_printed_longer_one_way_leaves_its_size_open() -> None:
 
 
 def _printed(longer: float, views: int, seed: int, uneven_m: float = 0.0) -> Observations:
-    """Views of a board that is printed longer and whose points lie aside and higher, as OpenCV projects it, under its
-    places as drawn.
+    """Views of a board that is printed longer, with displaced points, as OpenCV projects it; the
+    target is the drawing.
     """
     drawn, rng, shown = checkerboard(9, 6, 0.025).point_array, np.random.default_rng(seed), list[np.ndarray]()
     aside = np.random.default_rng([seed, 7]).normal(0.0, uneven_m * np.array([0.2, 0.2, 1.0]), drawn.shape)
@@ -152,8 +154,8 @@ def _off_sd(calibration: Calibration, quantity: str, truth: float) -> float:
 
 @pytest.mark.parametrize("seed", partly(range(6), [0, 1]))
 def test_a_board_printed_two_percent_longer_is_solved_for(seed: int) -> None:
-    """Given as places it was no board: points lay aside, or the aspect was off by 9 of its standard deviations, and a
-    rolling shutter was named. Of a board 2.5 % of the stretch were left.
+    """A target given by places was not treated as a board: its points were displaced, or the aspect had an error of 9
+    of its standard deviations, and a rolling shutter was reported. With a board, 2.5 % of the elongation remained.
     """
     calibration = calibrate(_printed(0.02, 12, seed))
     assert of_kind(calibration, "stretch").stretch == pytest.approx(
@@ -165,8 +167,8 @@ def test_a_board_printed_two_percent_longer_is_solved_for(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", partly(range(8), [0, 4]))
 def test_a_board_by_places_that_is_built_otherwise_is_no_stabilised_camera(seed: int) -> None:
-    """Its principal point moved by 5 to 20 px, and phi was 5 standard deviations off; so it was of seven views of
-    opencv_extra, where views that are left out are now predicted to 0.082 px, not 0.095.
+    """Its principal point moved by 5 to 20 px, and phi had an error of 5 standard deviations. The same happened with
+    seven views of opencv_extra, whose held-out views are now predicted to 0.082 px instead of 0.095 px.
     """
     calibration = calibrate(_printed(0.005, 7, seed, 5e-4))
     assert not any(one.kind == MOVES for one in calibration.effects)  # 2 of 40 with bows besides, 40 of 40 before
@@ -175,7 +177,7 @@ def test_a_board_by_places_that_is_built_otherwise_is_no_stabilised_camera(seed:
 
 @pytest.mark.parametrize("seed", partly(range(8), [0, 1, 2]))
 def test_what_few_views_do_not_tell_of_a_stretch_widens(seed: int) -> None:
-    """The aspect was up to 15 of its standard deviations off. Of boards as drawn nothing is visibly wider."""
+    """The aspect had errors of up to 15 of its standard deviations. Boards as drawn are not noticeably wider."""
     calibration = calibrate(_printed(0.005, 4, seed))
     assert _off_sd(calibration, "phi", 900.0) < 3.5 and _off_sd(calibration, "aspect", 1.0) < 4.0  # 2.1, 2.6 of sixteen
     sound, drawn = (calibrate(_printed(0.0, 4, seed), one) for one in (Options(), Options(as_built="as drawn")))
@@ -185,13 +187,13 @@ def test_what_few_views_do_not_tell_of_a_stretch_widens(seed: int) -> None:
 
 def test_places_that_move_are_a_board() -> None:
     places, pixels = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), np.eye(4, 2) * 100.0
-    for size, moves, is_board in ((0.1, True, True), (0.1, None, False), (60.0, True, False)):  # nobody holds 60 m
+    for size, moves, is_board in ((0.1, True, True), (0.1, None, False), (60.0, True, False)):  # too large to be held
         seen = Observations.from_points({"a": pixels, "b": pixels}, size * places, (640, 480), moves=moves)
         assert seen.targets["target"].movable == seen.targets["target"].bows == is_board
 
 
 def test_a_calibration_by_places_that_were_no_board_yet_scores_those_that_are() -> None:
-    """Files of earlier versions have places that move without saying so."""
+    """Files of earlier versions have places that move without an entry that says so."""
     seen, stretched = _printed(0.0, 12, 0), _printed(0.01, 12, 1)
     places = replace(seen.targets["target"], spec={**seen.targets["target"].spec, "movable": False})
     before = replace(seen, targets={"target": replace(places, movable=False, bows=False)})
@@ -201,7 +203,7 @@ def test_a_calibration_by_places_that_were_no_board_yet_scores_those_that_are() 
 
 
 def test_what_may_be_as_drawn_counts_as_far_as_it_is_probable() -> None:
-    """A board that is bowed with a probability of 3 in 4: phi is as much wider as half of what the bow makes of it."""
+    """A board that is bowed with a probability of 3/4: the uncertainty of phi contains as much of the bow."""
     _, observations = observed(Board(bow_m=1e-3), 0)
     bowed, drawn = (replace(one, tolerances={"board": Tolerance(warp_m=2e-3)}) for one in (BUILT, DRAWN))
     ends = []
@@ -217,7 +219,7 @@ def test_what_may_be_as_drawn_counts_as_far_as_it_is_probable() -> None:
 
 
 def test_few_numbers_are_held_by_little() -> None:
-    """Two bows leave their variance open: the sigma is wider than they are."""
+    """Two bows do not determine their variance: the sigma is larger than they are."""
     warp = of_kind(calibrate(observed(Board(bow_m=1e-3), 1)[1], BUILT), "warp")
     assert warp.sigma_m > 1.2 * warp.rms_m
 
@@ -241,7 +243,9 @@ def test_one_finding_for_a_board() -> None:
 
 
 def test_a_photographed_board_is_not_sheared(sony_boards: BoardDetections) -> None:
-    """Beside linear displacements of the image it was, by 2 mm of 90: phi came out at 660 px, and left 0.37 px."""
+    """With linear displacements of the image it was sheared by 2 mm over 90 mm; phi was 660 px,
+    with 0.37 px residuals.
+    """
     drawn, as_built = (calibrate(sony_boards.observations, replace(one, lens="brown")) for one in (DRAWN, BUILT))
     assert as_built.fit.points_rms_px < 0.8 * drawn.fit.points_rms_px  # 0.72 measured
     assert of_kind(as_built, "points").rms_m < 1e-4  # 0.05 mm measured
@@ -250,7 +254,7 @@ def test_a_photographed_board_is_not_sheared(sony_boards: BoardDetections) -> No
 
 @pytest.mark.parametrize("is_another_kind", [False, True])
 def test_points_of_another_kind_of_grid_are_no_inaccurate_board(is_another_kind: bool) -> None:
-    """Where circles of uneven rows stand under the names of even ones, a grid half a step aside explained them."""
+    """Circles of uneven rows have the names of even ones; a displacement by half a step must not explain them."""
     grid, rng, shown = circle_grid(8, 11, 0.02, 0.012, asymmetric=True), np.random.default_rng(0), list[np.ndarray]()
     places, matrix = grid.point_array, np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 480.0], [0.0, 0.0, 1.0]])
     while len(shown) < 12:
@@ -286,7 +290,7 @@ def test_lines_of_a_field_painted_by_hand() -> None:
 
 
 def test_512_numbers_are_quick() -> None:
-    """Nothing is solved with them all: as many solves as without (it was 19 s)."""
+    """No solve includes all of them: there are as many solves as without (it took 19 s)."""
     _, observations = observed(Board(points_m=2e-4, columns=16, rows=16, views=10), 0)
     calibration = calibrate(observations, BUILT)
     assert len(calibration.estimate.structure.names) == 512

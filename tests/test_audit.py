@@ -32,7 +32,7 @@ def sound() -> Calibration:
 
 @pytest.fixture(autouse=True)
 def _calibrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an audit compares with is the same for all audits of the same observations."""
+    """Audits of the same observations compare with the same calibration, which is made once."""
 
     def once(observations: Observations, options: Options) -> Calibration:
         key = observations.digest, repr(options)
@@ -63,7 +63,7 @@ def test_without_a_pose_the_best_one_is_taken() -> None:
     one = audit(bare, seen(4))["overhead"]
     assert one.holds and one.pose_free and "its file has none" in one.words
     swapped = planted.FAULTS["half a pixel"](sound().station().at(Pose.identity()))
-    # half a pixel is a turn by 0.03 degrees, which the pose takes up
+    # Half a pixel is a rotation by 0.03 degrees, which the pose absorbs.
     assert audit(calibration_of("a test", {"x": swapped}), seen(4))["overhead"].holds
     long = replace(sound().station(), phi=1.05 * sound().station().phi).at(Pose.identity())
     assert audit(calibration_of("a test", {"x": long}), seen(4))["overhead"].cause == "another focal length"
@@ -90,7 +90,7 @@ def test_other_stations_are_refused() -> None:
 
 
 def test_opencvs_own_calibration_of_real_photographs(real_data: Path) -> None:
-    """Made by OpenCV from every other photograph, audited against the rest."""
+    """OpenCV calibrates with every other photograph, and the rest is used for the audit."""
     board = checkerboard(9, 6, 0.025)
     corners = {}
     for path in sorted((real_data / "opencv_left_right").glob("left*.jpg")):

@@ -1,4 +1,4 @@
-"""The field without any start: strokes, how the camera looks, which way round, what is refused, and the command."""
+"""Detection of a field without an initial camera: strokes, upright direction, symmetry, refusals, and the command."""
 
 import json
 from pathlib import Path
@@ -59,7 +59,7 @@ def path(shot: script.Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def lopsided() -> Target:
-    """A field with one goal area only, at the left, and a diagonal: alike in no turn."""
+    """A field with a goal area only at the left, and a diagonal: it has no symmetry."""
     ends = {
         "top": (-2.0, 1.5, 2.0, 1.5),
         "bottom": (-2.0, -1.5, 2.0, -1.5),
@@ -130,7 +130,7 @@ def test_what_lies_towards_which_side() -> None:
         assert agreeing_with_facing(ways, [Facing("LeftGoalLine", side)], FIELD, NAMES) == left, side
     both = [Facing("LeftGoalLine", "top"), Facing("TopTouchLine", "left")]
     assert agreeing_with_facing(ways, both, FIELD, NAMES) == []
-    # Mirrored it is no way: no turn has the left goal at the top and the top touch line at the left.
+    # The facing names a mirrored field: no rotation has the left goal at the top and the top touch line at the left.
     with pytest.raises(InputError, match="choose one of left, right"):
         Facing("LeftGoalLine", "up")
 
@@ -192,7 +192,7 @@ def test_a_field_that_looks_alike_in_no_turn(mirrored: bool) -> None:
     image = photograph(scene, "overhead", "0001", seed=1).image
     grey = cv2.cvtColor(image[:, ::-1].copy() if mirrored else image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     found = search(grey, target, target.curve_names, Auto())
-    if mirrored:  # no camera that looks down sees it so
+    if mirrored:  # a camera that looks down does not see it mirrored
         assert found.followed is None and found.reason
     else:
         assert found.followed is not None and (found.ways, found.chosen_by) == (1, "")
@@ -203,7 +203,7 @@ def test_a_field_that_looks_alike_in_no_turn(mirrored: bool) -> None:
 
 @pytest.mark.parametrize("looks", [0, 5])
 def test_a_search_ends_and_says_so(shot: script.Shot, looks: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After so many looks at the clock. Another field's lines may fit in so many places that it took 200 s."""
+    """The search ends after so many reads of the clock; lines of another field once took 200 s."""
     clock = iter([0.0, *[1.0] * looks])
     monkeypatch.setattr("ceres_cal.detect.photographs.candidates.thread_time", lambda: next(clock, 1000.0))
     result = search(light(shot.picture.image), FIELD, NAMES, TOP)
@@ -213,7 +213,7 @@ def test_a_search_ends_and_says_so(shot: script.Shot, looks: int, monkeypatch: p
 
 @pytest.mark.parametrize("painted", partly(["A", "B"], ["B"]))
 def test_the_other_division_is_named(painted: str, tmp_path: Path) -> None:
-    """Where that is what is painted: whether nothing or clicks say where it is."""
+    """If the other division is painted, the message names it, with and without clicks."""
     asked = ssl_field("B" if painted == "A" else "A")
     shot = disturbed.taken("plain", 4, ssl_field(painted))
     path = tmp_path / "field.png"
@@ -241,7 +241,7 @@ def test_pictures_without_a_field_are_misses(kind: str) -> None:
 
 @pytest.mark.thorough
 def test_the_real_photograph_without_its_clicks(real_data: Path) -> None:
-    """Its lines wander by pixels: no lens is to bend after them."""
+    """Its lines deviate by pixels, which must not bend the lens."""
     path, target = real_data / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png", script.real_target()
     painted = [name for name in target.curve_names if name not in script.NOT_PAINTED]
     found = detect_field([path], target, Auto((Facing("LeftGoalLine", "left"),)), painted)
@@ -310,7 +310,7 @@ def test_what_disturbs_does_not_hide_the_field(kind: str, seed: int) -> None:
 
 
 def test_a_field_under_boxes_is_followed() -> None:
-    """They cover some lines wholly and leave others, as where a field is elsewhere."""
+    """They hide some lines completely and leave others, as if the field were elsewhere."""
     shot = disturbed.taken("covered", 5, FIELD)
     floor = FIELD.point_array
     away = [
@@ -324,7 +324,7 @@ def test_a_field_under_boxes_is_followed() -> None:
 
 
 def test_lines_that_motion_makes_faint_are_seen() -> None:
-    """Those across the way of the camera are a sixth as bright as those along it."""
+    """Lines across the motion are a sixth as bright as those along it."""
     shot = disturbed.taken("motion", 105, FIELD)
     aside = shot.camera.at(shot.camera.cam_from_world @ Pose(np.eye(3), np.array([0.9, 0.3, 0.0])))
     seen, beside = likelihoods_of_places(light(shot.image), [(FIELD, shot.camera), (FIELD, aside)], NAMES)
@@ -335,7 +335,7 @@ def test_lines_that_motion_makes_faint_are_seen() -> None:
 
 
 def test_corners_are_not_extrapolated_along_a_lens_that_folds() -> None:
-    """Brown's suits these smeared lines best, and folds 13 px beyond the corner that nothing was measured next to."""
+    """Brown's lens fits these blurred lines best, but folds 13 px beyond a corner near which nothing was measured."""
     shot = disturbed.taken("motion", 307, FIELD)
     seen = Tracker(light(shot.image), FIELD, NAMES, FreeIntrinsics()).refined_from(shot.camera).camera
     assert not seen.folds
@@ -352,7 +352,7 @@ def test_lines_are_measured_again_only_where_a_camera_has_them_elsewhere(shot: s
 
 
 def test_strokes_of_striped_floors_are_not_alone() -> None:
-    """Six stripes 20 px apart, and a line across at a distance."""
+    """Six stripes 20 px apart, and a distant line across."""
     y = 20.0 * np.arange(6)
     ends = np.stack([np.column_stack([np.zeros(6), y]), np.column_stack([np.full(6, 24.0), y])], axis=1)
     strokes = Strokes(np.concatenate([ends, [[[300.0, 0.0], [300.0, 24.0]]]]), np.ones(7))
@@ -360,7 +360,7 @@ def test_strokes_of_striped_floors_are_not_alone() -> None:
 
 
 def test_the_middle_of_the_lens_is_told_by_its_strokes() -> None:
-    """A part of a sensor: about its own quarter strokes are straighter than about the picture's middle."""
+    """In a part of a sensor, strokes are straighter about its own quarter than about the picture's centre."""
     problem = prepare_search(light(disturbed.taken("cropped", 14, FIELD).image), FIELD, FIELD.curve_names, Auto())
     centre = off_centre(problem).stroke_map.centre
     assert np.allclose(centre, (0.28 * 780.0, 0.72 * 580.0))

@@ -1,4 +1,4 @@
-"""The paper's four-point method: exact where it should be, and the bundle better than it where there is noise."""
+"""The paper's four-point method: exact without noise; with noise the bundle adjustment is better."""
 
 from __future__ import annotations
 

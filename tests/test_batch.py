@@ -1,4 +1,4 @@
-"""Many jobs: each one line, remembered, resumed, ranked; a failed one stops nobody, Ctrl-C leaves what is done."""
+"""Many jobs: one line each, stored, resumed, ranked; a failed one does not stop others, Ctrl-C keeps finished ones."""
 
 import json
 import os
@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A plan with a good camera, one that cannot be read, one that moved, and one whose file is missing."""
+    """A plan with a good camera, an unreadable file, a camera that moved, and a missing file."""
     folder = tmp_path_factory.mktemp("hall")
     observations = Observations.load(ROOT / "data" / "ssl_field" / "observations.json")
     observations.save(folder / "north.json")
@@ -216,7 +216,7 @@ def test_ctrl_c_leaves_what_is_done_and_no_process(tmp_path: Path) -> None:
     assert error.startswith("ceres-cal: interrupted: files written: ") and error.count("\n") == 1
     done = remembered(to)
     assert 0 < len(done) < 40 and all(one.level != "failed" for one in done.values())
-    for _ in range(50):  # Python's own tracker of resources ends when it sees that nobody is left
+    for _ in range(50):  # Python's resource tracker ends after all others
         left = subprocess.run(["ps", "-o", "stat=,args=", "-g", str(run.pid)], capture_output=True, text=True).stdout
         if not (alive := [line for line in left.splitlines() if not line.startswith("Z")]):
             break
@@ -225,7 +225,7 @@ def test_ctrl_c_leaves_what_is_done_and_no_process(tmp_path: Path) -> None:
 
 
 def _writing(folder: Path) -> None:
-    """What is interrupted while it writes, and would go on for long."""
+    """A job that is interrupted while it writes, and would go on for long."""
     with finishing():
         (folder / "begun").touch()
         time.sleep(0.3)

@@ -1,4 +1,4 @@
-"""What stands beside a field's own lines, and what is worn of them: neither is taken for the other."""
+"""Lines beside a field's own lines, and worn lines: neither is taken for the other."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def off_px(shot: disturbed.DisturbedShot, curve: Indices32, pixels: Array) -> Ar
 
 
 def test_a_boundary_line_is_no_touch_line_though_a_camera_is_bent_to_it() -> None:
-    """Four lines 10 px outside of the field's own are fitted as if they were those."""
+    """Four lines 10 px outside of the field's own lines are fitted as if they were the field's."""
     shot = disturbed.taken("boundary", 9, FIELD)
     start = replace(shot.camera, lens=Radial((0.0, 1.0e-6, 0.0, 1.4e-12), (2, 3, 4, 5)))
     free = unknown_optics(start, None)
@@ -53,7 +53,7 @@ def test_a_boundary_line_is_no_touch_line_though_a_camera_is_bent_to_it() -> Non
 
 
 def test_dashes_too_short_to_be_measured_are_visible() -> None:
-    """And nothing is where no paint is: beside the field."""
+    """And none are visible where there is no paint, beside the field."""
     shot = disturbed.taken("worn", 9, FIELD)
     assert set(visible_curves(light(shot.image), FIELD, shot.camera, NAMES)) >= {*OUTER, "LeftPenaltyStretch"}
     aside = shot.camera.at(shot.camera.cam_from_world @ Pose(np.eye(3), np.array([0.55, 0.37, 0.0])))

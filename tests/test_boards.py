@@ -1,4 +1,4 @@
-"""Boards in images: how many, how well, under which names, and what is said where there are none."""
+"""Boards in images: which are found, how accurately, with which names, and the messages where there are none."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,7 +36,7 @@ Paint = Callable[[Array], Array]
 
 
 def squares(columns: int, rows: int) -> Paint:
-    """A board with one more square than corners each way, the one between "0,0" and "1,1" dark, and a white margin."""
+    """A board with one more square than corners each way, dark between "0,0" and "1,1", and with a white margin."""
 
     def paint(places: Array) -> Array:
         x, y = places.T
@@ -49,9 +49,9 @@ def squares(columns: int, rows: int) -> Paint:
 
 
 def ideal_picture(camera: Camera, square_m: float, paint: Paint) -> Array:
-    """What each pixel sees: the mean over its area, at 64 places of a lattice wherever an edge runs through it.
+    """The mean brightness over each pixel, sampled at 64 places where an edge crosses it.
 
-    Within a pixel the camera is taken to be linear, which it is to a few 1e-5 px.
+    Within a pixel the camera is taken as linear, which is accurate to a few 1e-5 px.
     """
     width, height = camera.image_size
     middle = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
@@ -110,7 +110,7 @@ def test_corners_are_good_to_a_hundredth_of_a_pixel(tmp_path: Path, picture: Arr
     error = points.pixels - truth
     assert np.all(np.abs(error.mean(axis=0)) < 0.003)  # (0.0000, 0.0007)
     assert np.all(error.std(axis=0) < 0.008)  # (0.0054, 0.0043)
-    start = truth.astype(np.float32).reshape(-1, 1, 2)  # at the truth: cornerSubPix has no way to go wrong but its own
+    start = truth.astype(np.float32).reshape(-1, 1, 2)  # at the truth, so that only cornerSubPix's own error counts
     peer = cv2.cornerSubPix(read_grey(path), start, (7, 7), (-1, -1), (3, 100, 1e-4)).reshape(-1, 2)
     assert rms(error) < 0.5 * rms(peer - truth)  # 0.0049 against 0.0265
 
@@ -147,7 +147,7 @@ def test_corners_stay_good_whatever_the_camera_does(change: str, limit: float, p
 
 @pytest.mark.thorough
 def test_large_squares_out_of_focus() -> None:
-    """Squares of 120 px, blurred by 8 px: in discs of 20 px there is little but blur."""
+    """Squares of 120 px, blurred by 8 px: discs of 20 px contain almost only blur."""
     camera = Camera((1440, 1080), 1350.0, (730.0, 534.0), Radial((0.0,), (3,)))
     truth = camera.at(POSE).project(BOARD.point_array).reshape(6, 7, 2)
     image = photograph(ideal_picture(camera.at(POSE), 0.03, squares(7, 6)), blur_px=8.0)
@@ -280,7 +280,7 @@ def test_labelling_is_never_mirrored_and_stays_on_the_board(
 
 
 def _moved_aside(x_px: float, y_px: float, turn: float = 0.0, board: Target = BOARD) -> tuple[Image8, Array]:
-    """A picture of a board whose middle is so far from the picture's, and where its corners are."""
+    """A picture of a board whose centre is displaced from the picture's centre, and the pixels of its corners."""
     squares_of = board.grid
     assert squares_of is not None
     columns, rows = squares_of.columns, squares_of.rows
@@ -293,7 +293,7 @@ def _moved_aside(x_px: float, y_px: float, turn: float = 0.0, board: Target = BO
 
 @pytest.mark.parametrize("x_px, y_px, turn, levels", [(-220, 0, 0.0, 256), (0, -140, np.pi, 256), (-220, 0, 0.0, 20)])
 def test_a_board_partly_out_of_the_picture(x_px: float, y_px: float, turn: float, levels: int, tmp_path: Path) -> None:
-    """In twenty grey levels, too: OpenCV sees no squares there before the picture is made as bright as others."""
+    """Also with twenty grey levels, where OpenCV finds no squares before the contrast is increased."""
     image, truth = _moved_aside(x_px, y_px, turn)
     points = detect_boards([write(tmp_path / "a.png", image // (256 // levels))], BOARD).observations.points
     inside = np.all((truth > 3.0) & (truth < np.array([476.0, 356.0])), axis=-1)
@@ -332,7 +332,7 @@ def test_a_mirrored_grid_is_turned_over(truth: Array) -> None:
 def test_a_board_that_looks_alike_turned_is_named_as_it_is_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether OpenCV begins at its upper end or at the other, as in one of 35 pictures of a public set."""
+    """OpenCV may begin at either end, as in one of 35 pictures of a public set."""
     square, margin = 40, 60
     dark = np.add.outer(np.arange(6), np.arange(8)) % 2 == 0
     drawn = np.pad(np.kron(np.where(dark, 30, 220), np.ones((square, square))), margin, constant_values=220)
@@ -419,7 +419,7 @@ def test_any_size_of_image(width: int, limit: float, picture: Array, truth: Arra
 
 
 def test_dark_images(tmp_path: Path, picture: Array, truth: Array) -> None:
-    """Eleven grey levels in all: OpenCV's newer detector is blind there, the older one is not."""
+    """Eleven grey levels in all: OpenCV's newer detector finds nothing there, the older one does."""
     path = write(tmp_path / "a.png", photograph(picture) // 16)
     points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
     assert rms(points.pixels - truth) < 0.03  # 0.009
@@ -551,7 +551,7 @@ def test_wrong_targets(board: Target, message: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(1, 60_000), (60_000, 1), (40, 30_000), (1, 1), (7, 7)])
 def test_long_and_tiny_pictures_are_misses(size: tuple[int, int]) -> None:
-    """OpenCV turns a picture by 45 degrees: of 60000 x 1 px it made 5 GB."""
+    """OpenCV rotates a picture by 45 degrees; for 60000 x 1 px this took 5 GB."""
     scales = boards._scales(size)
     assert all(scale**2 * sum(size) ** 2 <= 16.001 * boards._MOST_PX for scale in scales)
     if not scales:
@@ -563,14 +563,14 @@ def test_long_and_tiny_pictures_are_misses(size: tuple[int, int]) -> None:
     ("size", "first"), [((480, 640), 1.0), ((1080, 1920), 0.98209), ((3000, 4000), 0.40825), ((1000, 10_000), 0.44721)]
 )
 def test_usual_pictures_are_searched_by_their_pixels(size: tuple[int, int], first: float) -> None:
-    """The large ones first as two megapixels, the small ones last at twice their size."""
+    """Large ones first at two megapixels, small ones last at twice their size."""
     assert boards._scales(size) == pytest.approx([first, 2.0] if first == 1.0 else [first, 1.0], abs=1e-5)
 
 
 @given(seed=st.integers(0, 1000), side=st.integers(2, 4))
 @settings(max_examples=6)
 def test_a_part_of_a_board_where_there_is_none_is_a_reason(seed: int, side: int) -> None:
-    """And no warning of NumPy's on the screen: squares that a detector saw, whose corners are none."""
+    """Squares that a detector reports, but that have no corners, cause no warning of NumPy."""
     rng = np.random.default_rng(seed)
     picture = rng.integers(0, 255, (120, 160), dtype=np.uint8)
     corners = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1) * 15.0 + rng.uniform(20.0, 60.0, 2)

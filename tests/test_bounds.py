@@ -1,4 +1,4 @@
-"""Pixels outside their image: many are refused with the likely cause, a few are named and counted."""
+"""Pixels outside their image: many are refused with the likely cause, a few are reported and counted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Change = Callable[[Array], Array]
 
 @cache
 def seen() -> Observations:
-    """Lines and arcs over an image of 1280 x 960 px."""
+    """Lines and arcs in an image of 1280 x 960 px."""
     return simulate(SCENES["radial-2-3/lines-arcs"](), Disturbance(0.3, 0.3)).observations
 
 
@@ -31,7 +31,7 @@ def with_pixels(change: Change) -> Observations:
 
 
 def with_moved(rows: int, pixel: tuple[float, float]) -> Observations:
-    """The same with the pixels of the first curve observations there, the next ones a pixel lower each."""
+    """The first curve observations moved to this pixel, each a pixel lower than the one before."""
     pixels = seen().curves.pixels.copy()
     pixels[:rows] = np.add(pixel, np.column_stack([np.zeros(rows), np.arange(rows)]))
     return with_pixels(lambda _: pixels)
@@ -49,7 +49,7 @@ def with_moved(rows: int, pixel: tuple[float, float]) -> Observations:
     ],
 )
 def test_another_image_size_is_refused(tmp_path: Path, size: tuple[int, int], change: Change, words: str) -> None:
-    """With the cause, and view, feature and pixel of the first; from a file with its name, too."""
+    """The message names the cause, and view, feature and pixel of the first one; from a file, its name, too."""
     wrong = replace(with_pixels(change), cameras={"overhead": size})
     with pytest.raises(InputError) as refused:
         calibrate(wrong, RADIAL)
@@ -64,7 +64,7 @@ def test_another_image_size_is_refused(tmp_path: Path, size: tuple[int, int], ch
 
 @pytest.mark.parametrize("rows, refused", [(2, False), (3, True)])
 def test_more_than_one_in_a_hundred_are_refused(rows: int, refused: bool) -> None:
-    """Of 223 observations; fewer are counted out loud, and do not decide."""
+    """Of 223 observations; fewer are reported, and do not influence the result."""
     wrong = with_moved(rows, (1300.0, 200.0))
     assert len(wrong.curves) == 223
     if refused:

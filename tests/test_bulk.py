@@ -1,4 +1,4 @@
-"""Very many observations of the world: a part decides, all of them are solved for, in shares."""
+"""Very many observations of the world: a part decides about outliers, and all are solved for, in shares."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class CalibrateInShares(Protocol):
 
 @pytest.fixture
 def in_shares(monkeypatch: pytest.MonkeyPatch) -> CalibrateInShares:
-    """A calibration of few observations as of very many: a dozen shares, a part of a quarter."""
+    """Calibrates few observations like very many: with a dozen shares, and a part of a quarter."""
 
     def calibrated(observations: Observations, progress: Callable[[Progress], None] | None = None) -> Calibration:
         with monkeypatch.context() as patch:
@@ -51,7 +51,7 @@ def rejected(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def assert_same(one: Calibration, other: Calibration) -> None:
-    """To what the loops leave, which end where noise scales change by less than a hundredth."""
+    """Up to the tolerance of the loops, which end when noise scales change by less than one percent."""
     posterior = other.uncertainty.posterior
     steps = difference(one.estimate, other.estimate, posterior.keys) / posterior.sd
     assert np.max(np.abs(steps)) < 0.03  # 0.014 measured
@@ -68,7 +68,7 @@ def test_all_take_part_though_a_part_decides(in_shares: CalibrateInShares) -> No
     assert_same(of_shares, of_all)
     assert of_shares.digest == observations.digest
     sds = of_shares.uncertainty.posterior.sd / of_all.uncertainty.posterior.sd
-    # 1.003 to 1.21 measured: scatter is looked at in other views, and how the floor is in the part alone.
+    # 1.003 to 1.21 measured: scatter is estimated from other views, and the floor from the part alone.
     assert np.all((sds > 0.95) & (sds < 1.3))
 
 

@@ -1,4 +1,4 @@
-"""The solve alone: its optimum, what it leaves alone, how it is stopped, and that it knows when it is there."""
+"""The solve alone: its optimum, fixed numbers, interruption, and convergence."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ def case(name: str) -> tuple[Observations, Options]:
 
 
 def start_of(name: str) -> Estimate:
-    """The true estimate with phi 0.1 % off, moved by 0.2 mm and 0.2 mrad: even a redescending loss finds the end."""
+    """The true estimate with phi 0.1 % off, moved by 0.2 mm and 0.2 mrad; even a redescending loss
+    converges from it.
+    """
     scene = SCENES[name]()
     observations, options = case(name)
     start = initialise(gather_sights(observations), options).estimate
@@ -97,9 +99,9 @@ def distance(a: Estimate, b: Estimate) -> float:
 
 
 class DenseSolver:
-    """The same robust problem for scipy: one row for each component, derivatives by differences, no elimination.
+    """The same robust problem for scipy: one row for each component, finite differences, no elimination.
 
-    An observation of length s counts rho(s^2): its components are multiplied with the root of rho(s^2) / s^2.
+    An observation of length s contributes rho(s^2): its components are multiplied by the root of rho(s^2) / s^2.
     """
 
     def __init__(self, name: str, weighting: Weighting) -> None:
@@ -158,7 +160,7 @@ def test_robust_optimum_is_scipys(name: str, loss: str) -> None:
     found = solved(name, weighting)
     expected, cost = DenseSolver(name, weighting).solve()
     assert found.converged and not found.failed
-    # With a loss it is scipy that stops short, 1e-8 of the cost above ours at most.
+    # With a robust loss scipy stops early, with a cost at most 1e-8 above ours.
     assert found.cost < cost * (1.0 + 1e-12)
     assert found.cost == pytest.approx(cost, rel=1e-7)  # 4e-15 (trivial), 1e-8 (tukey) measured
     assert distance(found.estimate, expected) < (1e-7 if loss == "trivial" else 1e-4)  # 8e-9, 2e-5 measured
@@ -167,7 +169,9 @@ def test_robust_optimum_is_scipys(name: str, loss: str) -> None:
 @pytest.mark.parametrize("loss", ["trivial", "huber"])
 @pytest.mark.parametrize("name", ["brown/two-cameras", "kannala-brandt/rings-field"])
 def test_no_step_leads_further_down(name: str, loss: str) -> None:
-    """Placements seen twice, eliminated ones and rings: the gradient by differences of the plain problem vanishes."""
+    """Placements seen twice, eliminated ones and rings: the finite-difference gradient of the plain
+    problem vanishes.
+    """
     weighting = Weighting(1.1, 0.9, loss, 2.5)
     dense = DenseSolver(name, weighting)
     dense.start = solved(name, weighting).estimate
@@ -178,7 +182,7 @@ def test_no_step_leads_further_down(name: str, loss: str) -> None:
         step[k] = 1e-3 if k < count - 6 * len(dense.poses) and dense_is_px(dense, k) else 1e-6
         jacobian[:, k] = (dense.rows(step) - dense.rows(-step)) / (2.0 * step[k])
     size = np.linalg.norm(jacobian, axis=0) * np.linalg.norm(rows)
-    told = size > 1e-6 * np.max(size)  # the roll of the rings moves nothing
+    told = size > 1e-6 * np.max(size)  # the rotation of the rings about their centre has no effect
     assert np.max(np.abs(jacobian.T @ rows)[told] / size[told]) < 1e-6  # 4e-8 measured
 
 
@@ -211,7 +215,7 @@ def test_history_falls_to_the_cost() -> None:
 
 
 def test_noise_scales_weigh_points_against_curves() -> None:
-    """Twice as sure of the curves: as if their sigmas were halved."""
+    """Halving a noise scale has the same effect as halving the sigmas."""
     observations, options = case("radial-2-3/field-boards")
     sure = replace(observations, curves=replace(observations.curves, sigma_px=0.5 * observations.curves.sigma_px))
     start = start_of("radial-2-3/field-boards")
@@ -255,7 +259,7 @@ def test_what_is_held_comes_back_as_it_was(held: str) -> None:
 
 
 def test_priors_on_what_is_held_are_no_contradiction() -> None:
-    """A fixed number under a prior: nothing to pull; the other half of a prior on the principal point still does."""
+    """A prior on a fixed number has no effect; the other component of a prior on the principal point still has."""
     name = "radial-2-3/corners"
     observations, options = case(name)
     options = replace(options, fixed={"cx": 651.3})
@@ -301,7 +305,7 @@ def test_a_failure_in_progress_comes_out_and_nothing_is_left_behind(name: str) -
         if now.iteration == 1:
             raise EnoughError
 
-    for _ in range(20):  # a crash of the process would need more than one try to be seen
+    for _ in range(20):  # a crash of the process might need more than one try
         calls.clear()
         with pytest.raises(EnoughError):
             solve(problem, start, progress)
@@ -311,7 +315,7 @@ def test_a_failure_in_progress_comes_out_and_nothing_is_left_behind(name: str) -
 
 
 def test_a_start_that_shows_nothing_fails_without_a_crash() -> None:
-    """The camera looks the other way: no residual can be evaluated."""
+    """The camera looks the other way, so that no residual can be evaluated."""
     name = "radial-2-3/corners"
     observations, options = case(name)
     start = start_of(name)
@@ -331,8 +335,8 @@ def test_an_exact_fit_leaves_nothing_to_gain() -> None:
 
 @pytest.mark.parametrize("seed", [2])
 def test_phi_against_height_does_not_creep(seed: int) -> None:
-    """Straight from above, by a lens whose coefficients go with powers of phi: 15 to 31 iterations, and over 80 to more
-    than 100 where Ceres moves these as they are.
+    """Seen from straight above with a lens whose coefficients scale with powers of phi: 15 to 31 iterations, and over
+    80 to more than 100 where Ceres varies them directly.
     """
     leaning = overhead_pose(-0.5, 0.1, 3.2, tilt_x_deg=1.0, tilt_y_deg=-0.5, yaw_deg=90.0)
     scene = field_scene(ssl_field("B"), {"c": scenes.camera("brown")}, {"c": Station("c", leaning)}, spacing_m=0.1)
@@ -344,7 +348,7 @@ def test_phi_against_height_does_not_creep(seed: int) -> None:
 
 
 def test_what_is_raised_on_the_way_to_a_cost_ends_the_solve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such as Ctrl-C: no exception travels through C++."""
+    """For example Ctrl-C: exceptions cannot propagate through C++."""
 
     def interrupted(*given: Any) -> Array:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""The package's cached property: the value is computed once, and nobody waits for another's."""
+"""The package's cached property: the value is computed once, and other instances do not wait for it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 
 class SlowObject:
-    """A value that takes as long as `go` is not set."""
+    """An object whose value takes until `go` is set."""
 
     def __init__(self) -> None:
         self.begun, self.go, self.calls = threading.Event(), threading.Event(), 0
@@ -42,9 +42,9 @@ def fast() -> SlowObject:
 
 
 def exit_code_of_fork(work: Callable[[], object], seconds: float) -> int | None:
-    """0 where a child that is forked now does the work, None where it hangs; it is ended either way."""
+    """0 where a forked child does the work, None where it hangs; the child is ended in both cases."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # from Python 3.12 on: there are threads, that is the point
+        warnings.simplefilter("ignore", DeprecationWarning)  # from Python 3.12 on, since the process has threads
         child = os.fork()
     if not child:
         try:
@@ -81,7 +81,7 @@ def test_threads_share_the_first_value() -> None:
 
 
 def test_nobody_waits_for_another_instance() -> None:
-    """With functools' of Python 3.11 the fork hangs for ever, and so does a second thread."""
+    """With functools of Python 3.11 the fork hangs for ever, and so does a second thread."""
     slow = SlowObject()
     thread = threading.Thread(target=lambda: slow.value)
     thread.start()

@@ -1,4 +1,4 @@
-"""The whole calibration: truth from noise-free scenes, robustness, what must not matter, priors, failures."""
+"""The whole calibration: noise-free scenes, robustness, invariances, priors, failures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 WORKDAY = replace(NOISE, outliers=0.05, wrong_labels=0.03)
 PLAIN: dict[str, Any] = {"loss": "trivial", "noise_scale": "stated", "reject_sigma": 1e9}
-"""Least squares and nothing else."""
+"""Plain least squares."""
 
 
 def options_for(scene: Scene, **more: Any) -> Options:
@@ -49,7 +49,7 @@ def observed(name: str, disturbance: Disturbance = NOISE, seed: int = 0) -> Simu
 
 @cache
 def solved(name: str, noise_scale: str = "estimate") -> Calibration:
-    """Of a scene as it is observed by default."""
+    """The calibration of a scene with its default observations."""
     simulation = observed(name)
     return calibrate(simulation.observations, options_for(simulation.scene, noise_scale=noise_scale))
 
@@ -73,7 +73,7 @@ def error_of_pose(found: Pose, truth: Pose) -> float:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_noise_free_scenes_return_the_truth(name: str) -> None:
-    """From a cold start, to 1e-6 relative; boards alone are placed before their camera, whose frame is the world."""
+    """Without an initial estimate, to 1e-6 relative; for boards alone the camera's frame is the world."""
     scene = SCENES[name]()
     simulation = observed(name, Disturbance())
     calibration = calibrate(simulation.observations, options_for(scene))
@@ -83,7 +83,7 @@ def test_noise_free_scenes_return_the_truth(name: str) -> None:
         assert error_of_pose(calibration.stations[station].cam_from_world, place.cam_from_world) < 1e-6  # 2e-11
     for placement, world_from_target in scene.placements.items():
         found = calibration.placements[placement]
-        if placement == "rings":  # nothing tells how far a sheet of circles is turned about its middle
+        if placement == "rings":  # the rotation of circles about their centre is not determined
             assert np.max(np.abs(found.translation - world_from_target.translation)) < 1e-6  # 4e-12 measured
             assert np.max(np.abs(found.rotation[:, 2] - world_from_target.rotation[:, 2])) < 1e-6
         else:
@@ -107,9 +107,9 @@ def camera_before(simulation: Simulation, view: View) -> Camera:
 
 
 def deviations_px(simulation: Simulation) -> Array:
-    """How far each observation, points first, lies from what it is named, as the true camera sees it.
+    """Distance of each observation (points first) from the feature that it names, as the true camera sees it.
 
-    Curves by a walk along the projected line or circle: good to 0.1 px.
+    For curves by sampling the projected line or circle, which is accurate to 0.1 px.
     """
     observations = simulation.observations
     points, curves = np.empty(len(observations.points)), np.empty(len(observations.curves))
@@ -128,7 +128,7 @@ def deviations_px(simulation: Simulation) -> Array:
 
 
 def walk_along(camera: Camera, target: Target, feature: int, side: int) -> Array:
-    """Pixels every 0.5 px or so along a curve that is continued beyond its ends, as the solve takes it."""
+    """Pixels about every 0.5 px along a curve, continued beyond its ends as in the solve."""
     is_arc = bool(target.is_arc[feature])
     low, high = list(target.curves.values())[feature].parameter_range
     beyond = 0.0 if is_arc else 0.3 * (high - low)
@@ -162,11 +162,11 @@ def test_gross_errors_are_listed_and_do_not_decide(name: str, seed: int) -> None
     listed[[entry.row + (points if entry.kind == "curve" else 0) for entry in calibration.rejected]] = True
     sigmas = deviations_px(simulation) / 0.3
     wrong = np.concatenate([simulation.points.flag, simulation.curves.flag]) != CLEAN
-    # Residuals are judged from an estimate that has its own error: between 4 and 7 sigma either answer is right.
-    assert np.all(listed[sigmas > 7.0])  # recall 1: every gross error, however it came about
+    # Residuals are judged with an estimate that has errors: between 4 and 7 sigma either answer is right.
+    assert np.all(listed[sigmas > 7.0])  # recall 1: every gross error of any kind
     assert not np.any(listed[sigmas < 4.0])
     assert np.all(wrong[listed])  # precision 1: 5 sigma take out no clean observation of these
-    assert np.count_nonzero(listed) > 0.5 * np.count_nonzero(wrong)  # many an outlier lies along its line
+    assert np.count_nonzero(listed) > 0.5 * np.count_nonzero(wrong)  # many outliers lie along their line
     if points > 50:
         assert calibration.fit.point_scale == pytest.approx(1.0, abs=0.1)  # of the stated 0.3 px; 0.06 measured
     if len(simulation.curves.flag) > 50:
@@ -178,7 +178,7 @@ def test_gross_errors_are_listed_and_do_not_decide(name: str, seed: int) -> None
     [("radial-3/two-cameras", 1), ("brown/two-cameras", 9), ("brown/two-cameras", 17), ("brown/two-cameras", 18)],
 )
 def test_hard_starts(name: str, seed: int) -> None:
-    """Four boards a camera, 60 px wide, one corner in ten far off: the radial alignment alone loses its way."""
+    """Four boards for each camera, 60 px wide, one corner in ten far off: the radial alignment alone fails."""
     simulation = observed(name, WORKDAY, seed)
     calibration = calibrate(simulation.observations, options_for(simulation.scene))
     for camera, truth in simulation.scene.cameras.items():
@@ -198,14 +198,14 @@ def test_hard_starts(name: str, seed: int) -> None:
 def test_no_board_is_left_in_its_mirrored_pose(
     lens: Any, phi: float, nearest_m: float, farthest_m: float, angle_deg: float, seed: int
 ) -> None:
-    """Small boards tilted by 15 to 45 degrees look nearly the same tilted the other way."""
+    """Small boards tilted by 15 to 45 degrees look nearly the same as with the opposite tilt."""
     camera = Camera((1280, 960), phi, (650.0, 470.0), lens)
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(9, 6, 0.05)
     scene = board_scene(board, {"camera": camera}, stations, 60, seed=5, held=BoardRanges((nearest_m, farthest_m)))
     calibration = calibrate(simulate(scene, NOISE, seed).observations, options_for(scene))
     assert calibration.rejected == ()
-    assert not any("placement" in warning for warning in calibration.warnings)  # phi may well have started from a guess
+    assert not any("placement" in warning for warning in calibration.warnings)  # phi may have started from a guess
     for placement, truth in scene.placements.items():
         turned = rotation_log(calibration.placements[placement].rotation @ truth.rotation.T)
         assert np.degrees(np.linalg.norm(turned)) < angle_deg
@@ -229,7 +229,7 @@ def test_what_is_listed_can_be_found_again() -> None:
 
 @pytest.mark.parametrize("reject_sigma", [3.0, 5.0])
 def test_rejection_begins_where_it_is_told(reject_sigma: float) -> None:
-    """One corner of 432 moved by a little less and a little more than that many of the stated sigmas (1 px)."""
+    """One of 432 corners is moved by a little less and a little more than so many stated sigmas (1 px)."""
     simulation = observed("brown/boards", Disturbance())
     points = simulation.observations.points
     options = options_for(simulation.scene, noise_scale="stated", reject_sigma=reject_sigma)
@@ -240,7 +240,7 @@ def test_rejection_begins_where_it_is_told(reject_sigma: float) -> None:
         assert [entry.row for entry in calibrate(moved, options).rejected] == rows
 
 
-# ---- what must not matter -------------------------------------------------------------------------------------------
+# ---- invariances ----------------------------------------------------------------------------------------------------
 
 Rearrange = Callable[[Observations], Observations]
 
@@ -307,7 +307,7 @@ def split(observations: Observations) -> Observations:
 )
 @pytest.mark.parametrize("rearranged", [permuted, renamed, split])
 def test_order_names_and_frames_do_not_matter(name: str, rearranged: Rearrange) -> None:
-    """At the stated noise to the end of the solve; an estimated noise is settled to 1 %, which shows in phi."""
+    """With the stated noise the solve converges fully; an estimated noise converges to 1 %, which affects phi."""
     simulation = observed(name)
     options = options_for(simulation.scene, noise_scale="stated")
     base = solved(name, "stated")
@@ -325,7 +325,7 @@ def test_order_names_and_frames_do_not_matter(name: str, rearranged: Rearrange) 
 
 
 def transformed(target: Target, pose: Pose, unit: float) -> Target:
-    """The same thing described in another frame, turned about z and shifted, and in another unit of length."""
+    """The same target in another frame, rotated about z and shifted, and in another unit of length."""
 
     def place(xyz: tuple[float, float, float]) -> tuple[float, float, float]:
         x, y, z = unit * pose.transform(np.array(xyz))
@@ -372,7 +372,7 @@ def test_frame_and_unit_of_the_world_do_not_matter(
 
 
 class DensePoints:
-    """One station that sees points of the world, plainly: residuals by `Camera.project`, minimised by scipy.
+    """One station that sees points of the world: residuals by `Camera.project`, minimised by scipy.
 
     Unknowns: the free intrinsics, and a left perturbation of the pose.
     """
@@ -410,7 +410,7 @@ class DensePoints:
 
 
 def value_of(prior: Prior, camera: Camera) -> Array:
-    """What the prior speaks of, as an array."""
+    """The quantity of the prior, as an array."""
     cx, cy = camera.principal_point
     values: dict[str, Any] = {"phi": camera.phi, "cx": cx, "principal_point": (cx, cy), **camera.lens.coefficients}
     values |= {"height_m": camera.position[2], "position_m": camera.position}
@@ -427,7 +427,7 @@ def without_prior() -> tuple[Camera, Array]:
 
 
 def test_the_optimum_is_that_of_a_dense_solver() -> None:
-    """Every number of the camera and its pose, without a prior, against scipy with derivatives by differences."""
+    """Every number of the camera and its pose, without a prior, compared with scipy and finite differences."""
     simulation = observed(POINTS_SCENE)
     found = calibrate(simulation.observations, options_for(simulation.scene, **PLAIN)).station()
     expected, _ = without_prior()
@@ -447,7 +447,9 @@ def test_the_optimum_is_that_of_a_dense_solver() -> None:
     ],
 )  # fmt: skip
 def test_priors_pull_as_gauss_says(owner: str, quantity: str) -> None:
-    """A prior as sure as the data, two of their standard deviations away, is met half-way; every number as by scipy."""
+    """A prior with the sigma of the data, two sigmas away, moves the number half-way; all numbers
+    agree with scipy's.
+    """
     simulation = observed(POINTS_SCENE)
     unpulled, covariance = without_prior()
     size = {"position_m": 3, "principal_point": 2}.get(quantity, 1)
@@ -464,7 +466,7 @@ def test_priors_pull_as_gauss_says(owner: str, quantity: str) -> None:
     assert error_of_pose(found.cam_from_world, expected.cam_from_world) < 1e-7  # 2e-9 measured
     if size == 1:
         pulled = (value_of(blank, found)[0] - before[0]) / spread
-        assert pulled == pytest.approx(1.0, abs=0.05)  # 0.005 measured: what is not linear
+        assert pulled == pytest.approx(1.0, abs=0.05)  # 0.005 measured: nonlinearity
 
 
 def test_a_prior_may_come_with_the_observations() -> None:
@@ -479,7 +481,7 @@ def test_a_prior_may_come_with_the_observations() -> None:
 
 
 def test_a_height_prior_cures_the_view_from_straight_above() -> None:
-    """Design, section 8: without it phi and height trade off; with it both are as good as the tape."""
+    """Design, section 8: without it phi and height are correlated; with it both are as accurate as the tape."""
     lens = Radial((-5.2e-5, 6.1e-7))
     stations = {"up": Station("camera", overhead_pose(0.1, -0.2, 5.0))}
     scene = field_scene(ssl_field("B"), {"camera": Camera((1280, 960), 868.0, (650.0, 470.0), lens)}, stations)
@@ -506,7 +508,7 @@ def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
             calibrate(observations, Options(lens="radial", usual_camera=False, priors=(prior,)))
 
 
-# ---- what is held ---------------------------------------------------------------------------------------------------
+# ---- fixed numbers --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -555,7 +557,7 @@ def test_everything_may_be_fixed_but_the_poses() -> None:
     assert len(observations.cameras) == 2
 
 
-# ---- observations that cannot tell ----------------------------------------------------------------------------------
+# ---- degenerate observations ----------------------------------------------------------------------------------------
 
 
 def kept(observations: Observations, points: Any = None, curves: Any = None) -> Observations:
@@ -585,7 +587,7 @@ def lines_named(*names: str) -> Observations:
 
 
 def test_what_agrees_with_no_camera_is_not_called_too_few() -> None:
-    """Nine corners, four of them as row, column: "1 measured numbers cannot determine ..." was all that was said."""
+    """Nine corners, four of them as (row, column). The message was only "1 measured numbers cannot determine ..."."""
     seen = corners_at(lambda p: np.arange(len(p)) < 9)
     pixels = seen.points.pixels.copy()
     pixels[::2] = np.minimum(pixels[::2, ::-1], 950.0)
@@ -594,7 +596,7 @@ def test_what_agrees_with_no_camera_is_not_called_too_few() -> None:
 
 
 def fourth_board_with(*rows: int) -> Observations:
-    """Eight boards, the fourth one with these corners only."""
+    """Eight boards, the fourth one with only these corners."""
     observations = observed("radial-2-3/boards").observations
     number = np.arange(len(observations.points)) % 54
     return kept(observations, (observations.points.view != 3) | np.isin(number, rows))
@@ -627,7 +629,9 @@ def test_observations_that_cannot_tell(observations: Callable[[], Observations],
 
 @pytest.mark.parametrize("most, height_m, tilt", [(8, 5.3, 0.31), (24, 4.5, 0.1)])
 def test_a_height_in_metres_over_a_target_in_millimetres(most: int, height_m: float, tilt: float) -> None:
-    """Next to no observation agrees with both: there was a traceback of NumPy, and a valley of a million components."""
+    """Almost no observation agrees with both; there were a traceback of NumPy and a mixture with a
+    million components.
+    """
     field, pose = ssl_field("B"), Pose.looking((0.3, -0.5, height_m), rotation_exp((np.pi - tilt, 0.02, 0.0)))
     camera = Camera((1280, 960), 700.0, (640.0, 480.0), Brown((-0.25, 0.06, 0.0, 0.0, 0.0))).at(pose)
     pixels = camera.project(field.point_array) + np.random.default_rng(1).normal(0.0, 0.5, (len(field.points), 2))
@@ -640,8 +644,8 @@ def test_a_height_in_metres_over_a_target_in_millimetres(most: int, height_m: fl
 
 
 def test_a_first_solve_that_keeps_three_points() -> None:
-    """Three of nine clicks are wrong; lenses were compared by three others, each alone in its part of the picture, and
-    a number was divided by zero.
+    """Three of nine clicks are wrong. Lenses were compared with three others, each alone in its part of the picture,
+    which led to a division by zero.
     """
     field, pixels = ssl_field("B"), np.full((len(ssl_field("B").points), 2), np.nan)
     clicks = {
@@ -665,14 +669,14 @@ def test_cameras_that_can_do_without_one_are_counted() -> None:
 
 
 def test_one_board_is_enough_for_a_pose_but_not_many() -> None:
-    """Four corners of one board among others with 54 are used."""
+    """Four corners of one board are used beside others with 54."""
     calibration = calibrate(fourth_board_with(0, 8, 45, 53), RADIAL)
     assert calibration.fit.points == 7 * 54 + 4
     assert calibration.cameras["camera"].phi == pytest.approx(868.0, rel=0.01)
 
 
 def test_views_without_observations_change_nothing() -> None:
-    """Frames in which a board or the field was looked for and not found."""
+    """Frames in which a board or the field was not found."""
     simulation = observed("brown/boards")
     base = solved("brown/boards")
     target, station = simulation.observations.views[0].target, simulation.observations.views[0].station
@@ -686,7 +690,7 @@ def test_views_without_observations_change_nothing() -> None:
 
 
 def test_a_field_that_no_view_shows_changes_nothing() -> None:
-    """The file of a field and boards, its views of the field left out."""
+    """The file of a field and boards, without its views of the field."""
     simulation = observed("brown/boards")
     targets = {**simulation.observations.targets, "field": ssl_field("B")}
     found = calibrate(replace(simulation.observations, targets=targets), options_for(simulation.scene))
@@ -703,7 +707,7 @@ def test_pixels_that_mean_nothing_give_no_camera(pixels: str) -> None:
 
 
 def test_a_lens_that_folds_inside_the_image_is_no_solution() -> None:
-    """Pincushion that turns at 716 px, boards out to 566 px, and an image that reaches 801 px."""
+    """A pincushion that folds at 716 px, boards up to 566 px, and an image that extends to 801 px."""
     camera = Camera((1280, 960), 900.0, (640.0, 480.0), Radial((0.0, -6.5e-7)))
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(checkerboard(9, 6, 0.05), {"camera": camera}, stations, 8, seed=3, held=BoardRanges((0.8, 1.2)))
@@ -758,7 +762,7 @@ def raising(error: BaseException) -> Callable[[], None]:
     ],
 )
 def test_an_exception_in_progress_ends_the_solve(stop: Callable[[], None], kind: type[BaseException], at: int) -> None:
-    """It comes out as it went in, nothing crashes, and the next calibration is not touched by it."""
+    """The exception is raised unchanged, nothing crashes, and the next calibration is not affected."""
     simulation = observed("radial-2-3/field-boards")
     options = options_for(simulation.scene)
     calls = 0
@@ -781,7 +785,7 @@ def test_an_exception_in_progress_ends_the_solve(stop: Callable[[], None], kind:
 
 
 def floor_error_m(camera: Camera, truth: Camera, height_m: float) -> float:
-    """How far apart the two put a pixel of the image onto the plane of that height, at the worst pixel."""
+    """Largest distance between the places of a pixel on the plane of this height, over a grid of pixels."""
     width, height = truth.image_size
     pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, 15), np.linspace(0, height - 1, 12)), -1).reshape(-1, 2)
     return float(np.max(np.linalg.norm(camera.locate(pixels, height_m) - truth.locate(pixels, height_m), axis=1)))
@@ -799,7 +803,7 @@ def test_the_papers_camera_comes_back_from_rings_and_field() -> None:
     assert a3 == pytest.approx(0.00000401304361, abs=3 * 3.0e-9)  # 0.7
     assert a1 * lens.ideal_radius(450.0) == pytest.approx(655.7, abs=3 * 0.2)  # 655.38 px measured
     truth = scene.camera_at("overhead")
-    # Tilted by 4 degrees, phi and height are known together only (4 % and 10 cm measured); the floor is known.
+    # Tilted by 4 degrees, only a combination of phi and height is known (4 % and 10 cm measured); the floor is known.
     assert calibration.warnings == ()
     assert calibration.uncertainty.verdict("camera", "overhead", "phi").verdict == "weak"
     ratio = camera.phi / camera.position[2] / (truth.phi / truth.position[2])
@@ -823,7 +827,7 @@ def test_the_sample_field_comes_back() -> None:
     [(1.0, ("", "", "")), (0.93, ("fx is estimated as 0.926", "fx is estimated as 0.930", "fx is estimated as 0.930"))],
 )
 def test_pixels_that_may_not_be_square_are_said_to(aspect: float, words: tuple[str, ...]) -> None:
-    """At 35 degrees square pixels with another phi suit a picture that was stretched, to 3 % of the noise."""
+    """At 35 degrees square pixels with another phi explain a stretched picture up to 3 % of the noise."""
     camera = Camera((1280, 960), 680.0, (643.0, 475.0), Brown((-0.12, 0.02, 0.0, 0.0, 0.0)), aspect)
     stations = {"overhead": Station("overhead", overhead_pose(0.0, -3.5, 5.0, -35.0))}
     scene = field_scene(ssl_field("B"), {"overhead": camera}, stations, spacing_m=0.1)

@@ -1,4 +1,4 @@
-"""The result and its file: exact round trip, one clear line for every file that is not right."""
+"""The result and its file: exact round trip, and one clear line for every file that is not right."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_baseline_can_be_kept_too(tmp_path: Path) -> None:
 
 
 def test_the_file_tells_people_where_the_camera_is(tmp_path: Path) -> None:
-    """Position and the paper's angles stand beside the pose they follow from."""
+    """Position and the paper's angles are stored beside the pose that determines them."""
     calibration = calibrated("brown/two-cameras")
     calibration.save(tmp_path / "calibration.json")
     data = json.loads((tmp_path / "calibration.json").read_text())

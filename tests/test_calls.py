@@ -1,6 +1,4 @@
-"""The doors to the compiled kernels: what they take, what they refuse, both builds, lenses that Python has alone, and
-the wheel.
-"""
+"""Calls of the compiled kernels: valid and invalid arguments, both builds, lenses in Python only, and the wheel."""
 
 from __future__ import annotations
 
@@ -55,7 +53,7 @@ def test_arrays_to_read_may_lie_in_any_way(tmp_path: Path) -> None:
 
 
 def test_arrays_to_fill_must_be_right_as_they_are() -> None:
-    """A copy would be filled in their place."""
+    """Otherwise a copy would be filled instead."""
     squared, frozen = np.array([0.25, 4.0, 16.0]), np.zeros(3)
     frozen.flags.writeable = False
     filled: tuple[AnyArray, ...] = (frozen, np.zeros(6)[::2], np.zeros(3, np.float32), np.zeros((3, 1)))
@@ -72,7 +70,7 @@ def test_arrays_to_fill_must_be_right_as_they_are() -> None:
 
 
 def test_rows_that_are_not_there_are_refused() -> None:
-    """Never read: what lies behind an array is somebody else's."""
+    """They are never read, since memory behind an array is not its own."""
     camera, seen = looked_at("brown")
     points, curves = take(seen, points=slice(None), curves=slice(None))
     optics, poses = camera_optics(camera), matrix(camera.cam_from_world)[None]
@@ -121,7 +119,7 @@ def test_groups_and_coefficients_that_are_not_there_are_refused() -> None:
 
 @pytest.mark.parametrize("lens", scenes.EVERY_LENS)
 def test_both_builds_answer_alike(lens: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one for every processor, and the one for those with AVX2, where the machine has it."""
+    """The build for every processor, and the one for processors with AVX2, if the machine has it."""
     camera, seen = looked_at(lens)
     cost, normal = normal_equations(camera, seen, "huber", 1.5)
     monkeypatch.setattr("test_kernels.core", lambda: import_module("ceres_cal.kernels._core"))
@@ -184,7 +182,7 @@ BARE = {name: value for name, value in os.environ.items() if name not in _OURS}
 
 
 def test_a_wheel_in_a_clean_environment_calibrates(tmp_path: Path) -> None:
-    """What was compiled by scripts/setup is in build/: only what changed since is compiled anew."""
+    """Files compiled by scripts/setup are in build/, so that only changes are compiled."""
     pytest.importorskip("scikit_build_core")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     build = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(ROOT)]

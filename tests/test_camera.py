@@ -1,4 +1,4 @@
-"""The camera: world, rays and pixels agree, and where there is no answer it says so."""
+"""The camera: world, rays and pixels are consistent, and NaN is returned where there is no answer."""
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
@@ -29,7 +29,7 @@ PIXELS = np.stack(np.meshgrid(np.linspace(-0.5, 1279.5, 17), np.linspace(-0.5, 9
 
 @st.composite
 def cameras(draw: st.DrawFn) -> Camera:
-    """A camera above the field, with pixels that need not be square, no more than 20 degrees askew."""
+    """A camera above the field, with pixels that need not be square, tilted by at most 20 degrees."""
     alpha, beta = (draw(st.floats(-0.25, 0.25)) for _ in range(2))
     rotation = rotation_from_euler(np.pi + alpha, beta, draw(st.floats(-np.pi, np.pi)))
     position = draw(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(1.5, 6.0)))
@@ -95,8 +95,8 @@ def test_only_the_pose_between_camera_and_point_counts(camera: Camera, motion: t
 
 
 def test_pixel_convention() -> None:
-    # Pixel (0, 0) is the centre of the top-left pixel: with the principal point in the middle of a 4 x 2 image, the ray
-    # through the camera's foot hits where the four middle pixels meet. x is to the right and y down.
+    # Pixel (0, 0) is the centre of the top-left pixel. With the principal point in the middle of a 4 x 2 image, the ray
+    # through the camera's foot passes the point where the four middle pixels meet. x is to the right and y down.
     camera = Camera((4, 2), 10.0, (1.5, 0.5), Radial((0.0, 0.0)), 1.0, Pose.looking([0.0, 0.0, 2.0], DOWN))
     pixels = camera.project([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 1.0]])
     assert pixels == pytest.approx(np.array([[1.5, 0.5], [2.5, 0.5], [1.5, -0.5], [1.5, 0.5]]), abs=1e-15)

@@ -1,4 +1,4 @@
-"""ChArUco boards: printed as OpenCV draws them, and told from chessboards by what a file says of them."""
+"""ChArUco boards: printed as OpenCV draws them, and distinguished from chessboards by their file."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ _CELL = 8  # px of a marker's cell; markers of 6 cells in squares of 8
 
 
 def printed(board: Target) -> Array:
-    """What its sheet shows within the outermost squares, at so many pixels to the cell."""
+    """The sheet inside the outermost squares, with so many pixels for each cell."""
     assert board.paper is not None and board.grid is not None
     side, sheet = (
         board.grid.spacing_m,

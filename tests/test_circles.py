@@ -1,4 +1,4 @@
-"""Grids of circles in rendered pictures against OpenCV's own detector, and sheets to print."""
+"""Grids of circles in rendered pictures, compared with OpenCV's own detector, and sheets to print."""
 
 import json
 from dataclasses import replace
@@ -120,7 +120,7 @@ def test_what_is_printed_is_what_a_camera_sees(board: Target) -> None:
 
 
 def test_a_large_sheet_is_drawn_by_its_shapes() -> None:
-    """The sample's own board is 1.2 x 0.9 m: as a picture of 400 dots an inch it took 6.6 GB and 17 s."""
+    """The sample's own board is 1.2 x 0.9 m: as a picture with 400 dots per inch it took 6.6 GB and 17 s."""
     content = sheet_pdf(checkerboard(9, 6, 0.1), "board")
     assert b"/Subtype /Image" not in content and len(content) < 20_000  # 12 kB measured
 
@@ -149,7 +149,7 @@ def test_as_typed(say: Say, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("words_alone")
 def test_run_takes_a_board_of_circles(say: Say, tmp_path: Path) -> None:
-    """It was refused as a field without painted curves, whose remedy takes chessboards alone."""
+    """It was refused as a field without painted curves, with advice that is right only for chessboards."""
     board, pictures = circle_grid(7, 5, 0.03, 0.02), tmp_path / "pictures"
     pictures.mkdir()
     for number, tilt in enumerate((0.3, -0.3, 0.4, -0.2)):

@@ -1,4 +1,4 @@
-"""The commands as someone types them: answers, wrong usage, bad input, Ctrl-C, progress."""
+"""The commands as users type them: answers, wrong usage, bad input, Ctrl-C, progress."""
 
 import io
 import json
@@ -62,7 +62,7 @@ def say(capsys: pytest.CaptureFixture[str]) -> Say:
 
 
 def refused(said: CommandResult, code: int = 2) -> str:
-    """The one line of an error, with nothing else said."""
+    """The error's single line; nothing else is printed."""
     assert said.code == code, said
     if said.out:  # with --json
         error = said.err.removeprefix("ceres-cal: ").removesuffix("\n")
@@ -245,7 +245,7 @@ def test_a_shell_completes(say: Say, tmp_path: Path, words: list[str], completed
 
 
 def test_what_is_to_be_done_at_the_end_is_done() -> None:
-    """Though the process does not take Python apart: what others registered, and what stands in the streams."""
+    """Exit handlers of others run, and streams are flushed, although Python is not finalised."""
     code = "import atexit; from ceres_cal.cli import main; atexit.register(print, 'last'); main(); print('never')"
     run = subprocess.run([sys.executable, "-c", code, "calibrate"], capture_output=True, text=True, check=False)
     assert (run.returncode, run.stdout) == (2, "last\n") and "required: OBS" in run.stderr
@@ -324,7 +324,7 @@ def test_choices_are_those_of_the_package() -> None:
 
 
 def _plain(options: Options) -> dict[str, Any]:
-    """As JSON has them."""
+    """The options as JSON stores them."""
     plain: dict[str, Any] = json.loads(json.dumps(asdict(options)))
     return plain
 
@@ -353,7 +353,7 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("words_alone")
 def test_one_verdict_on_the_screen_in_json_and_in_the_report(say: Say, tmp_path: Path) -> None:
-    """Two wrong labels that were taken out do no harm: nobody is told otherwise by another command or its exit code."""
+    """Two rejected wrong labels do no harm; no other command, and no exit code, says otherwise."""
     out, page = tmp_path / "calibration.json", tmp_path / "page.html"
     text = say("calibrate", SAMPLE, "-o", out, "--report", page).out
     data = json.loads(say("calibrate", SAMPLE, "--json").out)["verdict"]
@@ -396,7 +396,7 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert (floor["height_m"], robots["height_m"]) == (0.0, 0.15)
     assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.5  # 0.36, 0.41, 1.1 measured
     assert known["weak_directions"] == [] and known["unknown_placements"] == {} and known["seams"] == []
-    # Nothing given on the command line is what nothing given in Python is.
+    # The default options of the command line and of Python are equal.
     assert data["calibration"]["options"] == _plain(Options(lens="radial", terms=("tangential",)))
 
 
@@ -533,7 +533,7 @@ def test_a_baseline_says_nothing_of_its_uncertainty(say: Say) -> None:
 
 
 def test_warns_where_a_lens_may_not_suit(say: Say, tmp_path: Path) -> None:
-    """Where residuals are many times what was stated."""
+    """Where residuals are many times the stated sigmas."""
     seen = Observations.load(SAMPLE)
     points = replace(seen.points, sigma_px=seen.points.sigma_px / 20.0)
     curves = replace(seen.curves, sigma_px=seen.curves.sigma_px / 20.0)
@@ -678,7 +678,7 @@ def test_a_lens_that_folds_over_inside_the_image(say: Say, tmp_path: Path, calib
     assert "folds over at 50.0 px" in refused(say("locate", tmp_path / "folded.json", "640,480"))
 
 
-# ---- what else can happen -------------------------------------------------------------------------------------------
+# ---- other events ---------------------------------------------------------------------------------------------------
 
 
 def test_ctrl_c_leaves_nothing(say: Say, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -729,7 +729,7 @@ def test_no_usable_solution_is_3(say: Say, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_nobody_reads_on() -> None:
-    """`| head -1` ends the command quietly, and as it would have ended."""
+    """`| head -1` ends the command without a message, and with its usual exit code."""
     run = in_a_shell("set -o pipefail; for i in 1 2 3 4; do cc targets ssl-a --json; done | true", capture_output=True)
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
@@ -748,7 +748,7 @@ def test_locate_and_project_are_inverse(say: Say, calibrated: Path) -> None:
 
 
 def test_what_no_pixel_of_the_image_shows_is_not_located(say: Say, calibrated: Path) -> None:
-    """A mistyped pixel has a place on the floor, too, which the camera does not see."""
+    """The camera's model also maps a mistyped pixel to the floor, although the camera does not see it."""
     said = say("locate", calibrated, "640,480", "1500,1100", "-5,20")
     assert said.code == 1
     rows = [line for line in said.out.splitlines() if "no answer" in line]
@@ -826,10 +826,10 @@ def test_wrong_rows(
     assert words in refused(say("locate", calibrated, *arguments))
 
 
-# ---- simulate, and the way through ----------------------------------------------------------------------------------
+# ---- simulate, and the whole chain ----------------------------------------------------------------------------------
 
 
-# A single view from almost straight above leaves phi / height open: 213 mm too low and 7 mm off at robot height.
+# A single view from almost straight above leaves phi and height open: 213 mm too low, and 7 mm error at robot height.
 MORE_TO_SAY = {"fisheye": ("--lens", "kannala-brandt"), "field-2004": ("--prior", "height_m=2.5:0.01")}
 
 
@@ -903,7 +903,7 @@ def test_a_chessboard_is_named_alike_wherever_a_target_is() -> None:
 def test_targets_of_a_file(say: Say, tmp_path: Path) -> None:
     Observations.load(SAMPLE).save(tmp_path / "sample.npz")
     data = json.loads(SAMPLE.read_text())
-    _feature(data)  # whoever looks for the right name has a file with a wrong one
+    _feature(data)  # users who need this message have a file with a wrong name
     (tmp_path / "wrong.json").write_text(json.dumps(data))
     for path in (SAMPLE, tmp_path / "sample.npz", tmp_path / "wrong.json"):
         assert set(json.loads(say("targets", path, "--json").out)["targets"]) == {"field", "board"}
@@ -919,7 +919,7 @@ BOARD = ("--columns", 5, "--rows", 4, "--square", 0.03)
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
-    """A folder with a board, nothing, the board elsewhere, and a file that is no image."""
+    """A folder with a board, an empty picture, the board elsewhere, and a file that is no image."""
     folder = tmp_path / "photos"
     folder.mkdir()
     squares = np.indices((5, 6)).sum(axis=0) % 2

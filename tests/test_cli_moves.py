@@ -1,4 +1,4 @@
-"""refit, check, compare and export-table as someone types them."""
+"""refit, check, compare and export-table as users type them."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""undistort, and reports with photographs, as someone types them."""
+"""undistort, and reports with photographs, as users type them."""
 
 import errno
 import json
@@ -25,7 +25,7 @@ __all__ = ["say"]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A photograph, what was detected in it, and calibrations."""
+    """A photograph, the lines detected in it, and calibrations."""
     place = tmp_path_factory.mktemp("undistort")
     shot = script.take(0)
     (place / "in").mkdir()
@@ -56,7 +56,7 @@ def test_straight_images(say: Say, folder: Path) -> None:
     about = json.loads((out / "straight.json").read_text())
     matrix = np.array(about["matrix"])
     assert about["phi"] == matrix[0, 0] == matrix[1, 1] and about["black_px"] == 0
-    # What lies on the field is where K and the pose put it: the straight image is a pinhole's.
+    # K and the pose project points of the field to their pixels, since the undistorted image is a pinhole's.
     camera = Calibration.load(folder / "c.json").station()
     place = np.array([-2.0, 1.0, 0.0])
     seen = matrix @ (np.array(about["rotation"]) @ place + about["translation_m"])
@@ -122,7 +122,7 @@ def test_ctrl_c_says_what_is_written(say: Say, folder: Path, monkeypatch: pytest
 def test_several_stations(say: Say, folder: Path) -> None:
     two, photograph, out = folder / "two.json", folder / "in" / "shot.png", folder / "several"
     answer = json.loads(say("undistort", two, photograph, "-o", out, "--json").out)
-    assert answer["station"] is None and "rotation" not in answer  # straight all the same
+    assert answer["station"] is None and "rotation" not in answer  # undistorted all the same
     assert "name one: --station camera or second" in refused(say("undistort", two, photograph, "-o", out, "--top-view"))
     named = say("undistort", two, photograph, "-o", out, "--top-view", "--station", "second", "--json")
     assert json.loads(named.out)["station"] == "second"
@@ -207,7 +207,7 @@ def test_photographs_that_do_not_belong(say: Say, folder: Path, tmp_path: Path) 
     command = ("calibrate", folder / "obs.json", "--report", tmp_path / "page.html", "--quiet", "--images")
     assert "called like a frame of the observations, such as 'shot'" in refused(say(*command, wrong))
     wrong.rename(tmp_path / "shot.png")
-    # What can be seen only once the report is made leaves the calibration as it is.
+    # An error in the report leaves the calibration unchanged.
     said = say(*command, tmp_path / "shot.png", "-o", tmp_path / "c.json")
     assert said.code == 1 and said.err == "" and (tmp_path / "c.json").exists()
     assert said.out.startswith("This calibration ")

@@ -1,4 +1,4 @@
-"""The closed forms: the paper's sections 2 and 3.2 to 3.6 with its errata, and what the paper lacks."""
+"""The closed forms: the paper's sections 2 and 3.2 to 3.6 with corrections, and cases that the paper lacks."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def in_front(pose: Pose, plane: Array) -> Array:
 
 
 def same_up_to_scale(found: Array, expected: ArrayLike) -> float:
-    """Largest difference after both are scaled to unit size; the sign counts."""
+    """Largest difference after both are scaled to unit size; the sign is significant."""
     return float(np.max(np.abs(found / np.linalg.norm(found) - np.asarray(expected) / np.linalg.norm(expected))))
 
 
@@ -92,7 +92,9 @@ def dlt_rows(plane: Array, image: Array) -> Array:
 
 
 def as_printed(plane: Array, image: Array) -> Array:
-    """The paper's 8 x 9 matrix: its seventh column lacks x_i, its eighth has x_i'' in the rows of y_i'' too."""
+    """The paper's 8 x 9 matrix as printed: its seventh column lacks x_i, its eighth has x_i'' also in the rows of
+    y_i''.
+    """
     rows = dlt_rows(plane, image)
     rows[:, 6] /= np.repeat(plane[:, 0], 2)
     rows[1::2, 7] = rows[::2, 7]
@@ -107,13 +109,13 @@ def test_rows_of_the_dlt_are_not_the_printed_ones() -> None:
     found /= np.linalg.norm(found)
     assert np.max(np.abs(dlt_rows(plane, image) @ found.ravel())) < 1e-13  # 2e-16 measured
     assert np.max(np.abs(as_printed(plane, image) @ found.ravel())) > 0.03  # 0.047 measured
-    # Solved as printed, the four points themselves are missed, by a good part of their distances.
+    # With the printed equations, even the four points themselves are missed by much of their distances.
     printed = np.linalg.svd(as_printed(plane, image))[2][-1].reshape(3, 3)
     assert np.max(np.abs(sent(printed, plane) - image)) > 0.3  # 0.53 measured
 
 
 def test_h33_may_be_zero() -> None:
-    """World origin at depth 0 in the camera frame: the paper's h33 = 1 cannot be had, the null vector can."""
+    """The world's origin at depth 0 in the camera frame: the paper's h33 = 1 is impossible, the null vector is not."""
     looking_along = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # along x, from above the origin
     pose = Pose.looking((0.0, 0.3, 2.5), looking_along)
     assert pose.translation[2] == 0.0
@@ -154,7 +156,7 @@ def test_points_that_fix_no_homography(plane: list[tuple[float, float]], message
 
 
 def test_spread_is_asked_of_the_shape_alone() -> None:
-    """A long thin strip is no line, wherever it lies and however small it is."""
+    """A long thin strip is not taken for a line, at any place and any size."""
     strip = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1e-4), (0.0, 1e-4)])
     for scale, away in ((1.0, 0.0), (1e-3, 5.0), (1e3, -700.0)):
         require_spread(scale * strip + away)
@@ -184,7 +186,7 @@ def lambda_of(homography: Array, rotation: Array) -> float:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_the_rotation_minimises_the_papers_error(seed: int) -> None:
-    """Against a search over the paper's own four unknowns, started as it says: with the max-norm lambda."""
+    """Compared with a search over the paper's own four unknowns, started with the max-norm lambda as in the paper."""
     rng = np.random.default_rng(seed)
     pose = overhead_pose(0.4, -0.7, 2.5, rng.uniform(-20.0, 20.0), rng.uniform(-20.0, 20.0), 40.0 * seed)
     homography = 3.7 * homography_of(pose) + rng.normal(0.0, 0.2, (3, 3))
@@ -204,7 +206,7 @@ def test_the_rotation_minimises_the_papers_error(seed: int) -> None:
 
 @given(poses, st.floats(0.7, 1.4))
 def test_max_norm_is_what_the_paper_says_of_it(pose: Pose, wrong_phi: float) -> None:
-    """lambda is the larger norm, so with a phi that is wrong no column of H / lambda is longer than 1 (section 3.5)."""
+    """lambda is the larger norm, so that with a wrong phi no column of H / lambda is longer than 1 (section 3.5)."""
     homography = np.diag([wrong_phi, wrong_phi, 1.0]) @ homography_of(pose)
     norms = np.linalg.norm(homography[:, :2], axis=0)
     found = pose_from_homography(homography)
@@ -240,10 +242,10 @@ def test_the_papers_coefficients_come_back() -> None:
 
 
 def test_rings_of_the_sample_data_are_the_papers() -> None:
-    """data/field_2004: a sheet that is 1 degree askew and 3 px off the axis, 0.2 px of noise; its scale is free.
+    """data/field_2004: a sheet tilted by 1 degree and 3 px from the axis, 0.2 px of noise; its scale is free.
 
-    Noise alone is 0.2 px at 450 px, 2.5e-6 and 3.4e-9; what the sheet is askew, which circles cannot know, brings
-    0.7 px, 9e-6 and 1.3e-8 more (30 seeds). The bundle does know: see `test_calibrate`.
+    Noise alone causes 0.2 px at 450 px, 2.5e-6 and 3.4e-9. The tilt of the sheet, which circles do not determine, adds
+    0.7 px, 9e-6 and 1.3e-8 (30 seeds). The bundle adjustment determines it: see `test_calibrate`.
     """
     observations = Observations.load(ROOT / "data/field_2004/rings.json")
     radii_m = np.array([curve.length_m / (2.0 * np.pi) for curve in observations.targets["rings"].curves.values()])
@@ -279,7 +281,7 @@ PHI_DOWN = np.diag([PHI, PHI, 1.0])
 
 
 def seen_through(pose: Pose, profile: RadialProfile, count: int = 60, seed: int = 0) -> tuple[Array, Array]:
-    """Plane points and the offsets (N, 2) px that show them through a profile: exact, by way of the inverse."""
+    """Plane points and their exact offsets (N, 2) px through a profile, by its inverse."""
     offsets = np.random.default_rng(seed).uniform((-640.0, -480.0), (640.0, 480.0), (count, 2))
     plane = profile.lift(offsets) @ np.linalg.inv(PHI_DOWN @ homography_of(pose)).T
     return plane[:, :2] / plane[:, 2:], offsets
@@ -307,7 +309,7 @@ def test_radial_alignment_is_exact_on_exact_data() -> None:
 
 
 def test_radial_alignment_does_not_mind_wrong_labels() -> None:
-    """5 % of the points under the name of another, 0.3 px of noise."""
+    """5 % of the points have the name of another, 0.3 px of noise."""
     data = aligned_data(0.3, 0.05)
     profile, error_px, relative_error = radial_alignment(data, UNIT, terms=2, rounds=8)
     assert profile.coefficients == pytest.approx(PROFILE.coefficients, abs=0.005)  # 6e-4 measured
@@ -350,7 +352,7 @@ def test_homography_of_lines_alone() -> None:
 
 
 def test_lines_tell_the_profile() -> None:
-    """Straight lines are straight through the right profile only: best rank one of g3 x (1, c)."""
+    """Only through the right profile are straight lines straight: best rank one of g3 x (1, c)."""
     lines, offsets = lines_seen(VIEWS[0], PROFILE, some_lines(), 3)
     assert profile_from_lines(lines, offsets, UNIT, 2) == pytest.approx(
         PROFILE.coefficients, abs=1e-8
@@ -358,7 +360,7 @@ def test_lines_tell_the_profile() -> None:
 
 
 def test_parallel_lines_do_not_fix_a_homography() -> None:
-    """A whole pencil of solutions: the second singular value is as small as the first."""
+    """There is a one-parameter family of solutions: the second singular value is as small as the first."""
     parallel = np.column_stack([np.ones(8), np.zeros(8), np.linspace(-1.0, 1.0, 8)])
     lines, offsets = lines_seen(VIEWS[0], PROFILE, parallel, 3)
     assert fit_lines(lines, PROFILE.lift(offsets), 1)[0] is None

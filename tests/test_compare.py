@@ -1,4 +1,4 @@
-"""Two calibrations side by side."""
+"""Comparison of two calibrations."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,8 +32,8 @@ def test_equals_differ_nowhere(calibration: Calibration) -> None:
 
 @pytest.mark.thorough
 def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
-    """What two calibrations of the same camera differ by, over what they are expected to: 1, and any probability is as
-    likely.
+    """Differences of two calibrations of the same camera over the expected ones: their mean is 1, and probabilities are
+    uniform.
     """
     every = [calibrated_at_home(seed) for seed in range(1, 25)]
     pairs = [compare(a, b)["overhead"] for a, b in zip(every[::2], every[1::2], strict=True)]
@@ -46,7 +46,7 @@ def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
 
 
 def test_another_lens_is_compared_on_the_field_alone(calibration: Calibration) -> None:
-    """Numbers of one lens are none of another's: this was a KeyError wherever the lens was chosen otherwise."""
+    """Numbers of different lenses cannot be compared: this was a KeyError wherever the choice of lens differed."""
     other = calibrate(seen(HOME, DAY, 1).observations, Options(lens="brown", coefficients=("k1", "k2")))
     answer = compare(calibration, other)["overhead"]
     assert answer.holds is None and answer.change is not None and answer.change.maps[0].rms_mm < 40.0  # 5 mm
@@ -83,7 +83,7 @@ def test_no_station_in_common(calibration: Calibration) -> None:
 
 
 def test_the_only_station_of_each_may_be_called_otherwise(calibration: Calibration, tmp_path: Path) -> None:
-    """As it is after an export to a format that knows no names, and back."""
+    """For example after an export to a format without names, and an import."""
     export(calibration, "mrcal", tmp_path / "elsewhere.cameramodel")
     back = import_calibration(tmp_path / "elsewhere.cameramodel")
     assert list(back.stations) == ["elsewhere"]

@@ -1,4 +1,4 @@
-"""Whole lines, frames and placements that do not belong: found, named, taken out as one; nothing where all belong."""
+"""Whole lines, frames and placements that are wrong: found, named, rejected as one; none in correct scenes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LINES = ("TopTouchLine", "BottomTouchLine", "HalfwayLine", "CenterLine", "LeftPe
 
 @cache
 def half_field(frames: int = 1) -> Scene:
-    """One camera over half of a division B field."""
+    """One camera above half of a division B field."""
     cameras = {"overhead": Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7), (2, 3)))}
     pose = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=6.8, tilt_y_deg=-2.4, yaw_deg=90.6)
     stations = {"overhead": Station("overhead", pose)}
@@ -55,7 +55,7 @@ def rows_of(observations: Observations, line: str, frame: str | None = None) -> 
 
 
 def moved_aside(observations: Observations, line: str, aside_px: float, frame: str | None = None) -> Observations:
-    """The whole of a line along its image's normal."""
+    """A whole line displaced along its normal in the image."""
     rows, curves = rows_of(observations, line, frame), observations.curves
     away = curves.pixels[rows] - np.mean(curves.pixels[rows], axis=0)
     normal = np.linalg.eigh(away.T @ away)[1][:, 0]
@@ -65,12 +65,12 @@ def moved_aside(observations: Observations, line: str, aside_px: float, frame: s
 
 
 def wholes(calibration: Calibration) -> set[str]:
-    """What was taken out as a whole, without how much and how far."""
+    """The features that were rejected as a whole, without numbers."""
     return {one.reason.partition(":")[0] for one in calibration.rejected if one.is_of_whole}
 
 
 def error_sd(calibration: Calibration, scene: Scene) -> Array:
-    """Errors of everything shared, in stated standard deviations."""
+    """Errors of all shared numbers, in stated standard deviations."""
     estimate, posterior = calibration.estimate, calibration.uncertainty.posterior
     truth = replace(estimate, cameras=scene.cameras, stations=scene.stations)
     return np.asarray(difference(estimate, truth, posterior.keys) / posterior.sd)
@@ -96,7 +96,7 @@ def test_line_aside_in_the_only_frame_is_named_and_taken_out(line: str, aside_px
 
 @pytest.mark.parametrize("line", LINES)
 def test_line_a_little_aside_is_taken_out_or_named_in_doubt(line: str) -> None:
-    """1.2 px: four times the noise of one observation; standard deviations then hold for either explanation."""
+    """1.2 px: four times the noise of one observation; standard deviations then hold for both explanations."""
     calibration = calibrate(moved_aside(simulate(half_field(), NOISE, 2).observations, line, 1.2), RADIAL)
     about = [warning for warning in calibration.warnings if f"line {line!r} in frame '0001'" in warning]
     assert len(about) == 1
@@ -165,7 +165,7 @@ def test_frame_of_a_camera_that_was_elsewhere_is_taken_out() -> None:
 
 
 def test_board_that_is_not_its_drawing_is_taken_out() -> None:
-    """Labels and pose are fine, but its squares are a tenth longer one way: its own pose cannot take that up."""
+    """Labels and pose are right, but its squares are a tenth longer one way, which its own pose cannot absorb."""
     scene = held_boards(Radial((-5.2e-5, 6.1e-7), (2, 3)), count=10)
     observations = simulate(scene, NOISE, 6).observations
     view = observations.views[3]
@@ -188,7 +188,7 @@ def test_board_that_is_not_its_drawing_is_taken_out() -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("make", [half_field, lambda: lines_and_arcs("radial-2-3"), lambda: boards("brown")])
 def test_sound_scenes_lose_nothing(make: object, seed: int) -> None:
-    """0 of 200 in one frame of half a field, and none in doubt."""
+    """0 of 200 in one frame of half a field, and none reported as uncertain."""
     calibration = calibrate(simulate(make(), NOISE, seed).observations, RADIAL)  # type: ignore[operator]
     assert not wholes(calibration)
     assert not any("belongs" in warning for warning in calibration.warnings)
@@ -197,7 +197,7 @@ def test_sound_scenes_lose_nothing(make: object, seed: int) -> None:
 @pytest.mark.parametrize("seed", partly(range(4), [0]))
 @pytest.mark.parametrize("length_m", [0.1, 0.5, 2.0])
 def test_errors_that_agree_along_lines_take_no_line_out(length_m: float, seed: int) -> None:
-    """All lines then scatter aside: none by more than the others. Of 200 scenes of 2 m one loses a line."""
+    """All lines then scatter, none more than the others. In 200 scenes with 2 m one loses a line."""
     truth, spacing_m = simulate(half_field(), Disturbance(), 0).observations.curves, 0.2
     near = np.exp(-spacing_m / length_m)
     noise = np.random.default_rng(seed).standard_normal((len(truth.view), 2))
@@ -237,7 +237,7 @@ def test_rejected_warning_and_screen_say_which_and_how_far(tmp_path: Path, capsy
 
 
 def test_a_suspect_without_which_nothing_is_determined_stays_in() -> None:
-    """Three lines and few points of one frame: there is nothing to compare a line with."""
+    """Three lines and few points in one frame: there is nothing to compare a line with."""
     seen = simulate(half_field(), NOISE, 8).observations
     kept = np.zeros(len(seen.curves), dtype=bool)
     for line in ("TopTouchLine", "HalfwayLine"):
@@ -254,7 +254,7 @@ def test_covariance_is_widened_by_what_is_in_doubt() -> None:
 
 
 def offsets(values: Array) -> Offsets:
-    """Ten groups of one mode each, all directions as well determined."""
+    """Ten groups with one mode each; all directions are equally well determined."""
     size = np.full(len(values), 20.0)
     effects = RandomEffects(size, values, np.eye(len(values)), 200.0, 200 + len(values))
     modes = np.sqrt(20.0) * np.eye(len(values))[:, :, None]
@@ -263,7 +263,7 @@ def offsets(values: Array) -> Offsets:
 
 @pytest.mark.parametrize(("scatter", "is_wrong"), [(1.0, True), (5.0, False), (25.0, False)])
 def test_an_offset_is_judged_by_how_the_others_scatter(scatter: float, is_wrong: bool) -> None:
-    """In standard deviations of independent errors: 40 is wrong beside offsets of 1, and one of many beside 25."""
+    """In standard deviations of independent errors: 40 is wrong beside offsets of 1, and usual beside offsets of 25."""
     values = scatter * np.random.default_rng(3).standard_normal(10)
     values[4] = 40.0
     evidence = offsets(values)
@@ -282,7 +282,7 @@ def test_evidence_of_a_pair_does_not_depend_on_the_order() -> None:
 
 
 def test_solving_without_a_line_needs_the_placements_that_are_left() -> None:
-    """The problem of some observations frees no placement that nothing shows."""
+    """The problem with some observations must not free a placement that they do not show."""
     scene = boards("radial-3")
     observations = simulate(scene, NOISE, 0).observations
     calibration = calibrate(observations, RADIAL)
@@ -295,7 +295,7 @@ def test_solving_without_a_line_needs_the_placements_that_are_left() -> None:
 
 
 def test_many_features_are_competed_with_in_bounded_time() -> None:
-    """Where all were looked at together, at the cube of their number, 1350 points in three frames took 25 s."""
+    """All together took time cubic in their number: 1350 points in three frames took 25 s."""
     places = {
         f"p{column}_{row}": (0.1 * column - 2.0, 0.1 * row - 1.5, 0.0) for column in range(40) for row in range(15)
     }
@@ -315,8 +315,8 @@ def test_many_features_are_competed_with_in_bounded_time() -> None:
 
 
 def test_features_of_different_targets_are_different_wholes() -> None:
-    """Each target counts its features from 0: the tops of three poles and a corner were one whole, and were taken out
-    together, with all that told phi.
+    """Each target counts its features from 0. The tops of three poles and a corner were one whole, and were rejected
+    together, with all observations that determine phi.
     """
     scene = half_field(2)
     poles = {f"pole_{x}": custom({"top": (x, 0.3, 1.0)}) for x in (-3.0, -2.0, -1.0)}

@@ -1,4 +1,4 @@
-"""What is known beforehand is held against the observations: conflicts by name and size, in what is stated, too."""
+"""Priors are compared with the observations: contradictions are named with their size, and widen the uncertainty."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ NOISE = Disturbance(0.3, 0.3)
 
 @cache
 def seen(tilt_deg: float = 8.0, seed: int = 1, outliers: float = 0.0, across: float = 0.5) -> Observations:
-    """A field of division B, its lines and corners, from a camera at 4.02 m, tilted by so much of it across."""
+    """A field of division B, its lines and corners, from a camera at 4.02 m, tilted by `tilt_deg`,
+    with `across` of it.
+    """
     pose = overhead_pose(0.1, -0.2, HEIGHT_M, tilt_x_deg=tilt_deg, tilt_y_deg=-across * tilt_deg, yaw_deg=3.0)
     scene = field_scene(
         ssl_field("B"), {"overhead": camera("radial-2-3")}, {"overhead": Station("overhead", pose)}, spacing_m=0.2
@@ -73,7 +75,7 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
     free = calibrate(seen(), RADIAL)
     assert (conflict.kind, conflict.owner, conflict.quantity, conflict.unit) == ("prior", "overhead", "height", "m")
     assert conflict.stated == 3.0 and conflict.stated_sd == pytest.approx(0.005)
-    # What is said of the observations is what they say by themselves, at their own noise: solved, not extrapolated.
+    # The value of the observations alone is solved for with their own noise, not extrapolated.
     assert conflict.seen == pytest.approx(free.station().position[2], abs=1e-3)  # 2.5e-5 measured, of an sd of 0.06
     assert conflict.seen_sd == pytest.approx(
         free.uncertainty.posterior.sd_of("station", "overhead", "height"),
@@ -88,7 +90,9 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
 
 
 def test_nothing_is_promised_then() -> None:
-    """1 mm at robot height was promised, 27 mm off. The height is set aside, and both are within the bounds."""
+    """1 mm at robot height was promised with an error of 27 mm. The height is set aside, and the
+    bounds contain both.
+    """
     height = wrong().uncertainty.verdict("station", "overhead", "height")
     assert height.value == pytest.approx(HEIGHT_M, abs=0.1) and height.low < 3.0 < HEIGHT_M < height.high
     judged = verdict(wrong(), seen())
@@ -114,7 +118,7 @@ def test_a_number_that_contradicts_what_was_stated_is_in_conflict_wherever_it_is
 
 
 def test_what_holds_without_a_wrong_statement_is_shown_beside_the_bounds_with_it() -> None:
-    """Of a height in feet "869 ± 1399 px" was all that was said of phi."""
+    """For a height in feet, only "869 ± 1399 px" was reported for phi."""
     known, free = wrong().uncertainty, calibrate(seen(), RADIAL).uncertainty
     for number in (("camera", "overhead", "phi"), ("station", "overhead", "height")):
         alone, both = known.undisputed.verdict(*number), known.verdict(*number)
@@ -138,20 +142,20 @@ def test_a_right_height_is_no_conflict(tilt_deg: float) -> None:
 
 
 def test_outliers_and_rows_thrown_out_hide_nothing() -> None:
-    """The wrong height of a tilted camera throws rows out; the solve without it takes them back."""
+    """The wrong height of a tilted camera causes rejections; the solve without it takes these rows back."""
     (conflict,) = calibrate(seen(15.0, outliers=0.1), under(height(*WRONG))).conflicts
     assert abs(conflict.seen - HEIGHT_M) < 4.0 * conflict.seen_sd < 0.1
     assert conflict.sigmas > 30.0
 
 
 def test_where_nothing_tells_there_is_no_conflict() -> None:
-    """From straight above the observations know phi over height alone, and any height is as good."""
+    """From straight above, the observations determine only phi over height, so that any height is possible."""
     assert calibrate(seen(0.5), under(height(*WRONG))).conflicts == ()
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 8.0])
 def test_two_heights_contradict_each_other(tilt_deg: float) -> None:
-    """Also where the observations say nothing of either."""
+    """Also where the observations do not determine either."""
     calibration = calibrate(seen(tilt_deg), under(height(*RIGHT), height(*WRONG)))
     pair, *others = calibration.conflicts
     assert pair.kind == "priors" and {pair.stated, pair.seen} == {3.0, HEIGHT_M} and pair.sigmas > 100.0
@@ -175,7 +179,7 @@ PHI = Prior("camera", "overhead", "phi", (1500.0,), (2.0,))
 
 @pytest.mark.parametrize("lens, stated", [("auto", PHI), ("auto", height(2.0, 0.005)), ("spline", PHI)])
 def test_nothing_takes_up_a_grossly_wrong_statement(lens: str, stated: Prior) -> None:
-    """A phi of 1500 px was confirmed by a spline, without a word; a height of 2 m by a board and views that moved."""
+    """A phi of 1500 px was confirmed by a spline without a message, a height of 2 m by a board and moving views."""
     calibration = calibrate(sample(), Options(lens=lens, priors=(stated,)))
     (conflict,) = calibration.conflicts
     assert "the observations alone give" in conflict.words and calibration.warnings == (conflict.words,)
@@ -184,7 +188,7 @@ def test_nothing_takes_up_a_grossly_wrong_statement(lens: str, stated: Prior) ->
 
 
 def test_two_numbers_that_are_held_wrong_are_both_named() -> None:
-    """The phi alone was, and under it another lens was taken."""
+    """Only phi was named, and another lens was chosen with it."""
     calibration = calibrate(sample(), Options(fixed={"phi": 1736.0, "cx": 600.0}))
     seen = {one.quantity: (one.seen, one.seen_sd) for one in calibration.conflicts}
     truth = {"phi": 868.6, "cx": 647.0}
@@ -197,7 +201,7 @@ def test_two_numbers_that_are_held_wrong_are_both_named() -> None:
     [("radial", "a2", -2e-4, -5.2e-5), ("brown", "k1", -0.2, -0.349), ("auto", "aspect", 0.98, 1.0)],
 )
 def test_nothing_takes_up_what_is_held_wrong_of_a_lens(lens: str, quantity: str, held: float, truth: float) -> None:
-    """Boards and a line were taken out, and the aspect was a rolling shutter, without a word."""
+    """Boards and a line were rejected, and the aspect was explained by a rolling shutter, without a message."""
     calibration = calibrate(sample(), Options(lens=lens, fixed={quantity: held}))
     (conflict,) = calibration.conflicts
     assert (conflict.kind, conflict.quantity) == ("fixed", quantity) and conflict.stated == pytest.approx(held)
@@ -212,7 +216,7 @@ def test_how_far_a_lens_reaches_is_no_statement() -> None:
 
 
 def test_a_right_coefficient_that_is_held_tells_what_does_not_belong() -> None:
-    """Solved for without it, a few lines kept an outlier, and phi was 37 px farther off."""
+    """Without it, a few lines kept an outlier, and phi was 37 px farther off."""
     scene = field_scene(
         ssl_field("B"),
         {"overhead": camera("brown")},
@@ -227,14 +231,14 @@ def test_a_right_coefficient_that_is_held_tells_what_does_not_belong() -> None:
 
 
 def test_what_is_held_is_known_beside_everything_else() -> None:
-    """Lenses are compared with phi free, but what they leave open of the height, 36 mm, is of one phi."""
+    """Lenses are compared with phi free, but they leave the height open by 36 mm only because of phi."""
     known = calibrate(seen(), Options(fixed={"phi": 868.0})).uncertainty
     assert known.posterior.sd_of("station", "overhead", "height") < 0.01
     assert known.posterior.sd_of("station", "overhead", "height") > 0.003
 
 
 def test_a_fisheye_without_a_wrong_height_is_found_where_it_was_before() -> None:
-    """From where a height of 2.4 m had led, the observations alone said 2.16 m: phi 367 px, places 80 mm off."""
+    """From the estimate with a height of 2.4 m, the observations alone gave 2.16 m, phi 367 px, and errors of 80 mm."""
     pose = overhead_pose(0.1, -0.2, 3.2, tilt_x_deg=9.0, tilt_y_deg=-4.3, yaw_deg=3.0)
     cameras, stations = {"overhead": camera("kannala-brandt")}, {"overhead": Station("overhead", pose)}
     scene = field_scene(ssl_field("B"), cameras, stations, spacing_m=0.2)
@@ -244,7 +248,7 @@ def test_a_fisheye_without_a_wrong_height_is_found_where_it_was_before() -> None
 
 
 def test_no_lens_takes_up_a_phi_that_is_held_wrong() -> None:
-    """Under a phi of 1096 px a spline was taken, and the observations alone said 1854 +- 17 px of 548 px."""
+    """With a phi of 1096 px a spline was chosen, and the observations alone gave 1854 +- 17 px instead of 548 px."""
     seen_alone = simulate(SCENES["kannala-brandt/boards"](), NOISE, seed=7).observations
     calibration = calibrate(seen_alone, Options(fixed={"phi": 1096.0}))
     (conflict,) = calibration.conflicts
@@ -253,7 +257,7 @@ def test_no_lens_takes_up_a_phi_that_is_held_wrong() -> None:
 
 
 def test_a_right_number_that_is_held_tells_the_lens() -> None:
-    """Chosen without it that was Kannala and Brandt's, and the height 31 mm off with 3 mm stated."""
+    """Without it Kannala and Brandt's lens was chosen, and the height had an error of 31 mm with 3 mm stated."""
     held = {"phi": camera("radial-2-3").phi}
     calibration = calibrate(seen(18.0, 3, across=8.6 / 18.0), Options(fixed=held))
     assert calibration.options.lens == "radial" and not calibration.conflicts
@@ -262,7 +266,7 @@ def test_a_right_number_that_is_held_tells_the_lens() -> None:
 
 
 def test_statements_that_are_wrong_together_are_all_named() -> None:
-    """A phi and a height a fifth too large confirm one another: phi came out as 1037 px, and neither was named."""
+    """A phi and a height that are both 20 % too large agree: phi was 1037 px, and neither was named."""
     pose = overhead_pose(0.1, -0.2, HEIGHT_M, tilt_x_deg=7.2, tilt_y_deg=-3.4, yaw_deg=3.0)
     before = {"overhead": camera("radial-2-3")}, {"overhead": Station("overhead", pose)}
     scene = join(
@@ -276,17 +280,17 @@ def test_statements_that_are_wrong_together_are_all_named() -> None:
 
 
 def test_the_wrong_one_of_two_that_fight_is_named() -> None:
-    """A wrong phi makes a right height look wrong; without the phi it agrees."""
+    """A wrong phi makes a correct height look wrong; without the phi the height agrees."""
     phi = Prior("camera", "overhead", "phi", (700.0,), (5.0,))
     (conflict,) = calibrate(seen(), under(height(*RIGHT), phi)).conflicts
     assert (conflict.quantity, conflict.stated) == ("phi", 700.0)
     one, *_ = calibrate(seen(0.5), under(height(*RIGHT), phi)).conflicts
-    assert {"height", "phi"} <= set(one.words.replace(",", "").split())  # nothing tells which: both are named
+    assert {"height", "phi"} <= set(one.words.replace(",", "").split())  # either may be wrong: both are named
 
 
 @pytest.mark.parametrize("tilt_deg, seed, stated", [(0.5, 2, RIGHT), (8.0, 1, WRONG)])
 def test_no_line_is_blamed_for_what_is_stated(tilt_deg: float, seed: int, stated: tuple[float, float]) -> None:
-    """Two whole lines, 34 good rows, were taken out and a line was in doubt while statements had a part in it."""
+    """Two whole lines, 34 good rows, were rejected and a line was reported as uncertain because of wrong priors."""
     phi = Prior("camera", "overhead", "phi", (700.0,), (5.0,))
     calibration = calibrate(seen(tilt_deg, seed), under(height(*stated), *([phi] if stated == RIGHT else [])))
     assert calibration.conflicts and not calibration.rejected
@@ -312,7 +316,7 @@ def test_a_principal_point_held_at_the_middle_is_tested() -> None:
 
 @cache
 def askew(*lines: str) -> Observations:
-    """A field whose lines are painted 12 mm aside, and drawn as they should be."""
+    """A field with lines painted 12 mm beside their drawing."""
     field, painted = ssl_field("B"), {}
     for line in lines:
         drawn = field.curves[line]
@@ -332,7 +336,7 @@ def askew(*lines: str) -> Observations:
 
 
 def test_a_tolerance_that_is_too_tight() -> None:
-    """The calibration keeps its word, since lines under a tolerance are solved for."""
+    """The calibration stays correct, since lines with a tolerance are solved for."""
     observed = askew("HalfwayLine", "CenterLine", "LeftPenaltyStretch")
     calibration = calibrate(observed, Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.002)}))
     conflicts = {conflict.quantity: conflict for conflict in calibration.conflicts}
@@ -364,7 +368,7 @@ def test_a_height_measured_after_a_move_is_tested() -> None:
 
 
 def test_a_height_that_no_calibration_comes_out_of_is_named() -> None:
-    """The height is blamed, not the labels. Rounding decides whether a solve that begins so far off ends at all."""
+    """The height is named, not the labels. Whether a solve with such an error converges depends on rounding."""
     try:
         (conflict,) = calibrate(seen(), under(height(150.0, 5e-6 * 150.0))).conflicts
         words = conflict.words
@@ -374,7 +378,7 @@ def test_a_height_that_no_calibration_comes_out_of_is_named() -> None:
 
 
 def test_boards_in_another_unit_are_refused() -> None:
-    """One of 100 m squares, alone it would fit in any unit; one of 1 m squares lies under the floor."""
+    """With squares of 100 m alone it would fit in any unit; with squares of 1 m it is below the floor."""
     with pytest.raises(
         InputError, match=r"checkerboard: it reaches 943 m from its origin.*give its dimensions in metres"
     ):
@@ -393,8 +397,8 @@ def test_boards_in_another_unit_are_refused() -> None:
 @given(st.integers(0, 2**31), st.integers(1, 4), st.floats(1e-2, 1e2))
 @settings(max_examples=50)
 def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> None:
-    """C^-1 - P of numbers in any units is what the others say of them, also where that is nothing of some; the step
-    from where both are to where the others would be is one along what they say.
+    """C^-1 - P, in any units, is the information of the other observations, also where this is 0 for some numbers; the
+    step from the common optimum to that of the others lies in their subspace.
     """
     rng = np.random.default_rng(seed)
     units = 10.0 ** rng.uniform(-6.0, 3.0, size)
@@ -425,7 +429,7 @@ def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     assert after.sd == pytest.approx(np.sqrt(np.diagonal(expected)), rel=1e-6)
 
 
-# ---- what is usual --------------------------------------------------------------------------------------------------
+# ---- usual cameras --------------------------------------------------------------------------------------------------
 
 
 def cropped(left_px: int) -> Observations:
@@ -443,7 +447,7 @@ def cropped(left_px: int) -> Observations:
 
 
 def test_a_cropped_picture_has_no_usual_principal_point() -> None:
-    """The data say where it is: what is usual gives way."""
+    """The data determine it, so that the prior gives way."""
     usual, alone = (calibrate(cropped(400), replace(RADIAL, usual_camera=on)) for on in (True, False))
     assert not usual.conflicts
     assert usual.station().phi == pytest.approx(868.0, rel=0.02)
@@ -453,7 +457,7 @@ def test_a_cropped_picture_has_no_usual_principal_point() -> None:
 
 
 def test_what_is_usual_moves_nothing_that_the_data_determine() -> None:
-    """Beside a camera of which nothing is taken for usual but that its pixels are square."""
+    """Compared with a camera without priors except square pixels."""
     held = replace(RADIAL, usual_camera=True, free_aspect=False, free_skew=False)
     with_it, without = (calibrate(seen(15.0), options) for options in (held, RADIAL))
     sd = without.uncertainty.posterior.sd_of("camera", "overhead", "phi")

@@ -1,4 +1,4 @@
-"""The constants that decide something: each is there, stands with its reason, and can be set for a measurement."""
+"""The constants that decide something: each exists, has a comment with its reason, and can be set for a measurement."""
 
 import ast
 import subprocess
@@ -40,7 +40,7 @@ def test_it_is_a_number(constant: Constant) -> None:
 
 @each_constant
 def test_its_reason_stands_beside_it(constant: Constant) -> None:
-    if "." in constant.name:  # a default of a class, whose docstring speaks of it
+    if "." in constant.name:  # a default of a class, whose docstring explains it
         return
     lines, number, after = assignment(constant.module, constant.name)
     beside = "#" in lines[number - 1] or lines[number - 2].startswith("#")
@@ -65,7 +65,7 @@ def test_changes() -> None:
 
 
 def test_a_constant_is_set_where_it_is_read() -> None:
-    """Where it is defined, where it was imported to, and as the default of a dataclass; in a process of its own."""
+    """In its module, where it was imported, and as the default of a dataclass; in a new process."""
     code = (
         "from constants import Constant; from ceres_cal.problem.parameters import Options; "
         "import ceres_cal.effects.table.lens as lens_rows; "
@@ -80,7 +80,7 @@ def test_a_constant_is_set_where_it_is_read() -> None:
 
 @pytest.mark.thorough
 def test_figures_are_measured(tmp_path: Path) -> None:
-    """Where next to nothing counts as known, more directions are weak; an error is told, not hidden."""
+    """If almost nothing counts as known, more directions are weak; an error is reported."""
     constant = Constant("posterior.uncertainty", "KNOWN", ("verdicts",))
     now, then = measured("verdicts", 1, tmp_path), measured("verdicts", 1, tmp_path, constant, 1e-6)
     assert "weak directions named, 1 deg" in changes(now, then)

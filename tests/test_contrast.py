@@ -17,7 +17,7 @@ def stated(sd: float, offsets: Array, freedom: float = np.inf) -> NormalDistribu
 def test_what_differs_in_one_number_is_seen_in_that_number() -> None:
     first, second = stated(1.0, np.array([0.3, 0.1, 2.0])), stated(2.0, np.array([-4.7, 0.1, -1.0]))
     found = contrast(first, second, KEYS[:1])
-    # With cx and cy alike in both, phi's difference of 5 has variance 1 + 4, a fifth of it the first one's.
+    # With equal cx and cy, phi's difference of 5 has variance 1 + 4, one fifth of which is the first one's.
     assert found.statistic == pytest.approx(5.0) and found.degrees == 1
     assert found.shares == pytest.approx([0.2])
     assert contrast(first, second, KEYS).statistic == pytest.approx(25.0 / 5.0 + 9.0 / 5.0)
@@ -36,7 +36,7 @@ def test_what_either_knows_nothing_of_is_not_tested() -> None:
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.9])
 def test_the_rate_holds_given_the_first_statement(share: float) -> None:
-    """Of 400 first statements nineteen in twenty call less than 1 % of true second ones false, about."""
+    """For 95 % of 400 first statements, the false alarm rate over true second statements is below about 1 %."""
     rng, freedom = np.random.default_rng(0), 60.0
     error = np.sqrt(share) * rng.standard_normal((400, 1, 7))
     noise = np.sqrt(rng.chisquare(freedom, (400, 500)) / freedom)[..., None]

@@ -1,4 +1,4 @@
-"""Observations that are there twice: found bit for bit, counted once, and said."""
+"""Repeated observations: found bit for bit, counted once, and reported."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def calibrated(name: str = "radial-2-3/field-boards") -> Calibration:
 
 
 def again(observations: Observations, name: str = "again") -> Observations:
-    """The same pictures under other names, as a second detector run over copied files would give them."""
+    """The same pictures with other names, as a second detector run with copied files would give them."""
     views = [replace(view, frame=f"{view.frame} {name}") for view in observations.views]
     views = [v if v.placement is None else replace(v, placement=f"{v.placement} {name}") for v in views]
     return replace(observations, views=tuple(views))
 
 
 def assert_same(one: Calibration, other: Calibration) -> None:
-    """The same numbers, and as well known, to the last bit."""
+    """The same numbers with the same uncertainty, to the last bit."""
     assert one.station() == other.station() and one.fit == other.fit
     assert dict(one.placements) == dict(other.placements)
     assert one.posterior is not None and other.posterior is not None
@@ -66,7 +66,7 @@ def test_one_file_given_twice_counts_once() -> None:
 
 @pytest.mark.parametrize("times", partly([1, 99], [1]))
 def test_frames_under_other_names_count_once(times: int) -> None:
-    """The boards in them, too, whose placements are not solved for."""
+    """The boards in them, too; their placements are not solved for."""
     many = calibrate(combine([seen(), *(again(seen(), f"again {n}") for n in range(times))]), RADIAL)
     assert_same(many, calibrated())
     others = f", and so do {8 * times - 1} other frames"
@@ -120,7 +120,7 @@ PIXELS = np.random.default_rng(0).uniform(0.0, 900.0, (6, 2))
 
 
 def sources(views: list[View], points: Points) -> list[int]:
-    """View that each row is a copy out of."""
+    """The view that each row is a copy of."""
     return [int(view) for view in find_copies(views, points, NO_CURVES).points]
 
 
@@ -133,7 +133,7 @@ def test_a_view_is_a_copy_whatever_the_order_of_its_rows() -> None:
 
 @given(st.integers(0, 2**31), st.integers(1, 6), st.booleans())
 def test_copies_of_any_number_in_any_order_leave_the_first(seed: int, times: int, whole: bool) -> None:
-    """Two frames, each again and again with its rows in another order: what counts are their own rows."""
+    """Two frames, repeated several times with their rows in another order: only their own rows count."""
     rng = np.random.default_rng(seed)
     own = rng.uniform(0.0, 900.0, (2, 6, 2))
     own = np.round(own) if whole else own
@@ -146,7 +146,7 @@ def test_copies_of_any_number_in_any_order_leave_the_first(seed: int, times: int
 
 @given(st.integers(0, 2**31))
 def test_a_static_camera_of_whole_pixels_sees_other_frames(seed: int) -> None:
-    """Most of its rows come again in some other frame; its frames do not repeat each other."""
+    """Most of its rows occur in some other frame, but its frames do not repeat each other."""
     seen = np.round(
         np.repeat(10.0 * PIXELS[None], 20, axis=0) + np.random.default_rng(seed).normal(0.0, 2.0, (20, 6, 2))
     )
@@ -171,14 +171,14 @@ def test_other_features_stations_and_targets_are_no_copies() -> None:
 
 
 def test_few_whole_pixels_may_agree() -> None:
-    """Three rows are no copy in another frame; in the same frame a single one is."""
+    """Three rows are not enough for a copy of another frame; in the same frame a single one is."""
     assert sources(views_of("1", "2"), points_of(PIXELS[:3], PIXELS[:3])) == [-1] * 6
     assert sources(views_of("1", "2"), points_of(PIXELS[:4], PIXELS[:4])) == [-1] * 4 + [0] * 4
     assert sources(views_of("1", "1"), points_of(PIXELS, PIXELS[:1])) == [-1] * 6 + [0]
 
 
 def test_what_a_view_adds_counts() -> None:
-    """A frame that came twice, the second time with more in it."""
+    """A frame that was given twice, the second time with more rows."""
     assert sources(views_of("1", "1"), points_of(PIXELS[:4], PIXELS)) == [-1] * 4 + [0] * 4 + [-1] * 2
 
 

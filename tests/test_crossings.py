@@ -1,4 +1,4 @@
-"""Crossings of a target's curves: where they are, what they are called, and that they are points like others."""
+"""Crossings of a target's curves: their places, their names, and that they are points like others."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_every_crossing_lies_on_both_curves(shapes: list[Curve]) -> None:
 
 
 def test_what_is_sampled_to_meet_has_a_crossing() -> None:
-    """Against brute force: a sign change of one curve's distance along the other, ends and tangents kept away."""
+    """Compared with sampling: a sign change of one curve's distance along the other, away from ends and tangents."""
     circle, line = Arc((0.2, 0.1, 0.0), 1.0, -2.0, 1.0), Segment((-2.0, -0.4, 0.0), (2.0, 0.6, 0.0))
     along = np.linspace(0.0, 1.0, 200001)
     there = np.column_stack([np.interp(along, [0, 1], [-2, 2]), np.interp(along, [0, 1], [-0.4, 0.6])])

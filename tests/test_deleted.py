@@ -1,4 +1,4 @@
-"""An outlier is what the others alone predict elsewhere, whether it took part or not."""
+"""An outlier differs from the prediction of the others, whether it took part in the fit or not."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ STATED = replace(RADIAL, noise_scale="stated", reject_sigma=1e6)
 
 
 class Scene:
-    """A scene's observations, solved for without some of them, all at their stated sigmas."""
+    """A scene's observations, solved for without some of them, all with their stated sigmas."""
 
     def __init__(self, name: str, loss: str) -> None:
         self.observations: Observations = simulate(SCENES[name](), Disturbance(NOISE_PX, NOISE_PX), 0).observations

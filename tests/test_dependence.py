@@ -1,4 +1,4 @@
-"""Errors that belong together are counted together."""
+"""Correlated errors are counted together."""
 
 import json
 from dataclasses import replace
@@ -57,7 +57,7 @@ def factors(calibration: Calibration) -> Array:
 
 @pytest.mark.parametrize("length_m", partly([0.3, 0.6], [0.3]))
 def test_a_length_along_lines_is_recovered(length_m: float) -> None:
-    """Over eight runs; the grid has factors of two."""
+    """Over eight runs; the grid of lengths has factors of two."""
     lengths, shares = [], []
     for seed in range(8):
         calibration = calibrate(half_a_field(partial(along_lines, length_m=length_m), seed), HALF.options)
@@ -68,7 +68,7 @@ def test_a_length_along_lines_is_recovered(length_m: float) -> None:
         lengths.append(curves.length_m)
         shares.append(curves.share)
     assert np.exp(np.mean(np.log(lengths))) == pytest.approx(length_m, rel=0.5)
-    assert np.median(shares) >= 0.9  # all of the noise goes together
+    assert np.median(shares) >= 0.9  # all of the noise is correlated
 
 
 def test_white_noise_stays_white() -> None:
@@ -77,7 +77,7 @@ def test_white_noise_stays_white() -> None:
 
 
 def test_distorted_views_widen_everything() -> None:
-    """Where one view alone is distorted, it is taken out as a whole, or all widens: accuracy/intervals.py."""
+    """If one view alone is distorted, it is rejected as a whole, or everything widens: accuracy/intervals.py."""
     errors = partial(warped, sigma_px=1.0, views=3)
     assert np.median([factors(calibrate(ten_boards(errors, seed), TEN.options)) for seed in range(6)]) > 1.1
 
@@ -90,7 +90,9 @@ def test_lines_that_are_each_aside_are_named() -> None:
 
 @pytest.mark.thorough
 def test_what_all_frames_share_does_not_shrink_with_them() -> None:
-    """The same errors in six frames of a static camera: as wide as one frame alone, not by the root of six."""
+    """The same errors in six frames of a static camera: the uncertainty is that of one frame, not
+    smaller by root six.
+    """
     one = half_a_field(partial(along_lines, length_m=0.5), 3)
     rng, count = np.random.default_rng(0), len(one.curves)
     views = tuple(replace(one.views[0], frame=f"{n}") for n in range(6))
@@ -120,7 +122,7 @@ def test_lengths_that_halve_are_squares() -> None:
 
 
 def test_what_all_frames_share_of_points_does_not_shrink_either() -> None:
-    """Corners in six frames of a static camera, off by the same in each of them."""
+    """Corners in six frames of a static camera with the same errors in each of them."""
     one = simulate(corners("radial-2-3"), Disturbance(points_sigma_px=0.5), 0).observations
     rng, pixels = np.random.default_rng(1), one.points.pixels
     frames = [
@@ -135,10 +137,10 @@ def test_what_all_frames_share_of_points_does_not_shrink_either() -> None:
         calibrate(observations, Options(lens="radial", powers=(2, 3))).uncertainty.posterior.sd
         for observations in (sum(frames[1:], frames[0]), one)
     )
-    assert np.median(several / alone) == pytest.approx(1.0, abs=0.2)  # were they not seen: 0.4
+    assert np.median(several / alone) == pytest.approx(1.0, abs=0.2)  # without this 0.4
 
 
-# ---- it does not depend on how things are put -----------------------------------------------------------------------
+# ---- it does not depend on the representation -----------------------------------------------------------------------
 
 
 def test_the_order_of_views_does_not_matter() -> None:
@@ -171,8 +173,8 @@ def test_a_tenth_of_the_stated_sigma_is_the_same_data() -> None:
 
 
 def test_what_was_stated_and_does_not_scatter_may_be_shared() -> None:
-    """One picture, lines stated 2.5 times as uncertain as they scatter: as likely as not that is an error they share.
-    Where all have one sigma it is only a unit.
+    """One picture whose lines have stated sigmas 2.5 times their scatter: the rest may be an error that they share. If
+    all have one sigma, it is only a unit.
     """
     one = half_a_field(partial(along_lines, length_m=1e-3))
     count = len(one.curves)
@@ -258,7 +260,7 @@ def test_a_mixture_has_the_tails_of_its_widest_part() -> None:
 
 
 def _family(rng: np.random.Generator) -> tuple[StrandFamily, Array]:
-    """Nine strands of three shapes over three views, and the columns of all their rows: private, two shared, left."""
+    """Nine strands of three shapes over three views, and the columns of all rows: private, two shared, residuals."""
     places = [np.column_stack([rng.uniform(0.0, 1.0, (count, 2)), np.zeros(count)]) for count in (20, 28, 20)]
     strands, first = [], 0
     for number in (0, 1, 0, 2, 0, 1, 1, 0, 2):
@@ -288,7 +290,7 @@ def test_strands_of_one_shape_are_multiplied_as_one_matrix() -> None:
 
 
 def test_the_likelihood_is_that_of_the_whole_covariance() -> None:
-    """Of all rows at once, private placements and what is shared as columns, the shared ones known to one."""
+    """Of all rows at once; columns are private placements and shared numbers, the latter with unit information."""
     family, columns = _family(np.random.default_rng(1))
     at = likelihoods([family], False, float(np.sum(columns[:, 6:8] ** 2)))
     group = np.concatenate([np.full(len(s.rows), g) for s, g in zip(family.strands, family.group, strict=True)])
@@ -326,7 +328,7 @@ def _split(family: StrandFamily, values: Array) -> list[Array]:
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 5))
 def test_what_observations_say_alone_is_what_their_scores_leave(seed: int, seen: int) -> None:
-    """A^T C^-1 A, whatever the prior says and however little the observations do; less than nothing it never is."""
+    """A^T C^-1 A for any prior and any number of observations; it is never negative."""
     rng = np.random.default_rng(seed)
     half, prior = rng.standard_normal((seen, 5)), rng.standard_normal((5, 5)) * 10.0 ** rng.uniform(-2, 2)
     root = np.linalg.inv(np.linalg.cholesky(half.T @ half + prior.T @ prior + 1e-9 * np.eye(5))).T
@@ -366,7 +368,7 @@ def test_the_spread_of_scores_is_that_over_all_pairs_of_views() -> None:
     "name", partly(["lines together over 0.5 m", "ten boards, smooth errors"], ["ten boards, smooth errors"])
 )
 def test_intervals_hold_where_errors_go_together(name: str) -> None:
-    """scripts/accuracy/intervals.py has more runs; without it 62 % and 68 %."""
+    """scripts/accuracy/intervals.py has more runs; without this, coverage is 62 % and 68 %."""
     found = cover(CASES[name], range(15))
     assert found.far == 0 and found.failed == 0
     assert 0.88 < share(found.parameters)[0] < 0.995
@@ -375,7 +377,7 @@ def test_intervals_hold_where_errors_go_together(name: str) -> None:
 
 
 def test_rows_without_a_residual_take_no_part() -> None:
-    """A lens in the middle of its valley may not show them all: their scores would be no numbers."""
+    """A lens in the middle of its valley may not project all of them; their scores would be NaN."""
     observations = Observations.load(Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json")
     sights = gather_sights(observations)
     there = residuals(sights, initialise(sights, Options(lens="radial")).estimate)
@@ -387,7 +389,7 @@ def test_rows_without_a_residual_take_no_part() -> None:
 
 
 def test_places_far_apart_have_no_correlation_at_all() -> None:
-    """A line every 0.2 m in two frames, at about the same places: with correlations of 1e-155 among its entries, LAPACK
+    """A line every 0.2 m in two frames, at about the same places. With correlations of 1e-155 among its entries, LAPACK
     found no eigenvalues of this matrix, and a refit was refused.
     """
     first = "0 .19911 .4 .60031 .80303 .99905 1.20013 1.39871 1.5986 1.79864 1.99939 2.19921 2.40065 2.59749 2.79885"
@@ -402,7 +404,9 @@ def test_places_far_apart_have_no_correlation_at_all() -> None:
 
 
 def test_rounding_widens_nothing_that_priors_alone_know() -> None:
-    """A direction of which observations say 3e-10 of all: a score's covariance is rounded by as much."""
+    """A direction with a share of 3e-10 from observations: the covariance of a score has rounding
+    errors of this size.
+    """
     seen = Information((Key("camera", "one", "phi", "px"), Key("camera", "one", "cx", "px")), np.diag([1.0, 3e-10]))
     rounded = Scatter(np.eye(2), np.eye(2) - np.diag([0.0, 2.9e-10]), Dependence())
     np.testing.assert_allclose(rounded.widened(seen).matrix, seen.matrix, atol=1e-12)
@@ -412,7 +416,7 @@ def test_rounding_widens_nothing_that_priors_alone_know() -> None:
     ("variance", "probability", "widens"), [(4.0, 0.9, True), (0.2, 0.9, False), (4.0, 0.1, False)]
 )
 def test_what_takes_width_back_is_no_reason_for_it(variance: float, probability: float, widens: bool) -> None:
-    """Views that scatter less than what is within them says are likely, and no cause of a larger deviation."""
+    """Views that scatter less than expected from within them are no cause of a larger deviation."""
     between = GroupScatter(12, variance, probability, 10.0)
     dependence = Dependence(between=between)
     assert dependence.is_likely == (probability > 0.5)

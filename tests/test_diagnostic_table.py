@@ -1,4 +1,4 @@
-"""The table of effects: one that nobody has heard of is tested, named and shown like the built-in ones."""
+"""The table of effects: a new effect is tested, named and shown like the built-in ones."""
 
 import json
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ WAVE_PX, PERIOD_PX = 0.5, 200.0
 
 
 def wave(pixels: Array) -> Array:
-    """(N,) by how much rows of the sensor lie to the right, in amplitudes."""
+    """(N,) horizontal displacement of the sensor's rows, in amplitudes."""
     return np.sin(2.0 * np.pi * pixels[:, 1] / PERIOD_PX)
 
 
@@ -46,7 +46,7 @@ def words_of_wave(evidence: Evidence) -> Words:
 
 
 WAVE = Effect("wave", columns_of_wave, words_of_wave, absorbed=True)
-"""Rows of pixels lie to the right and left in turn, as a sensor on a shaking mount reads them."""
+"""Rows of pixels are displaced to the right and left in turns, as by a sensor on a shaking mount."""
 
 
 def swaying(pixels: Array) -> Array:
@@ -60,7 +60,7 @@ def in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def swayed() -> Observations:
-    """Seen by a camera whose rows of pixels sway."""
+    """Observations by a camera whose rows of pixels are displaced by a wave."""
     scene = scenes.overhead(boards=4)
     seen = simulate(scene, scenes.NOISE, 1).observations
     points, curves = seen.points, seen.curves

@@ -1,4 +1,4 @@
-"""Diagnostics: the table against brute force, planted faults by name, silence where nothing is wrong."""
+"""Diagnostics: the table compared with brute force, planted faults by name, and no findings in correct scenes."""
 
 import csv
 import json
@@ -73,7 +73,7 @@ def test_rows_are_the_derivatives_of_the_residuals(lens: str) -> None:
     sights = gather_sights(seen)
 
     def residual(change: Array) -> Array:
-        """Every equation's residual with intrinsics and station moved."""
+        """Residuals of all equations with changed intrinsics and station."""
         (name,) = estimate.cameras
         camera = with_intrinsics(estimate.cameras[name], intrinsics_vector(estimate.cameras[name]) + change[:-6])
         (station,) = estimate.stations
@@ -154,7 +154,7 @@ def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:
     hat = np.einsum("ei,ij,ej->e", whole, np.linalg.inv(information), whole)
     assert model.leverage == pytest.approx(hat, abs=1e-8)
     assert model.unknowns == problem.layout.size
-    # At the end of the solve there is no step left to take.
+    # At the end of the solve no step remains.
     assert np.max(np.abs(model.step)) < 0.1
 
 
@@ -448,7 +448,7 @@ def test_the_command(run: Run, tmp_path: Path, observations: Observations, calib
 
 @pytest.mark.parametrize("moved_px, named", [(0.0, False), (15.0, True)])
 def test_another_camera_s_pictures_are_named(moved_px: float, named: bool) -> None:
-    """Two cameras' pictures in one folder, or a lens that was knocked half-way."""
+    """Pictures of two cameras in one folder, or a lens that was knocked half-way."""
     board, stations = checkerboard(9, 6, 0.1), {"camera": Station("camera", Pose.identity())}
     parts = []
     for number, off in enumerate((0.0, moved_px)):

@@ -1,4 +1,4 @@
-"""Dimensions of a field that are not known: solved for with the camera, named where nothing measures them."""
+"""Unknown dimensions of a field: solved for with the camera, and reported where nothing determines them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def scene() -> Scene:
 
 
 def seen(what: Scene, seed: int = 1) -> Observations:
-    """Observations of the odd field, said to be of division B's."""
+    """Observations of the odd field, with division B as the target."""
     observations = simulate(what, Disturbance(0.1, 0.1), seed).observations
     return replace(observations, targets={**observations.targets, "field": FIELD})
 
@@ -67,7 +67,7 @@ def solved() -> tuple[Observations, Calibration]:
 
 @pytest.mark.parametrize("name", TRUE)
 def test_a_field_that_is_not_as_long_or_wide_as_drawn_is_named(name: str) -> None:
-    """1 % is drawn too much; measured 8.999 ± 0.007 m and 6.000 ± 0.004 m."""
+    """The drawing is 1 % too large; measured 8.999 ± 0.007 m and 6.000 ± 0.004 m."""
     true = FIELD.dimensions[name]
     painted = field_scene(FIELD, {"a": CAMERA}, {"s": Station("a", overhead_pose(0.2, -0.15, 5.0, 9.0, -6.0))})
     observations = simulate(painted, Disturbance(0.2, 0.2), 1).observations
@@ -141,11 +141,11 @@ def test_beside_tolerances_and_boards() -> None:
     structure = calibration.estimate.structure
     assert structure.own == 65 == len(structure.offsets) and len(structure.values) == 67
     known = calibration.uncertainty.verdict("dimension", "field", "field_length_m")
-    assert known.low < 8.28 < known.high and 0.002 < known.sd < 0.02  # 5 mm: its lines may lie aside
+    assert known.low < 8.28 < known.high and 0.002 < known.sd < 0.02  # 5 mm: its lines may be displaced
 
 
 def shared_board(square_m: float) -> Observations:
-    """Two cameras over a field see a board of such squares at the same moments, which is taken to have 0.1 m."""
+    """Two cameras above a field see a board with such squares at the same time; the target has squares of 0.1 m."""
     rng, field, board = np.random.default_rng(1), ssl_field("B"), checkerboard(9, 6, 0.1)
     true, places = checkerboard(9, 6, square_m).point_array - (0.4, 0.25, 0.0), field.point_array
     shown: list[Observations] = []
@@ -167,7 +167,7 @@ def shared_board(square_m: float) -> Observations:
 
 
 def test_a_board_that_contradicts_the_field_is_named_and_solved_for() -> None:
-    """Of a rig that sees it together it was said that a camera had moved, or that points were shifted."""
+    """For a rig that sees it together, a moved camera or shifted points were reported."""
     observations = shared_board(0.099)
     (found,) = (one for one in diagnose(calibrate(observations), observations).findings if one.kind == "other length")
     assert found.subject == "board/square_m" and re.search(r"is 0\.0990\d ± 0\.000\d+ m, not 0\.1 m", found.sentence)
@@ -243,7 +243,7 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
 
     monkeypatch.setattr(Tracker, "refined", counted)
     assert main([*asked, "--picture", str(tmp_path / "refused.png")]) == 2
-    assert len(seen) == 1  # other dimensions suit square pixels: no picture that is stretched is looked for
+    assert len(seen) == 1  # other dimensions fit with square pixels, so no stretched picture is searched
     error = capsys.readouterr().err
     assert re.search(r"the field (length|width) is [78]\.\d % smaller than the target says", error)
     assert "--estimate" in error  # says what would help
@@ -268,7 +268,7 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
 
 @pytest.mark.parametrize(("aspect", "is_said"), [(1.004, False), (1.0085, True)])
 def test_pixels_as_far_from_square_as_no_known_camera_has_them_are_said(aspect: float, is_said: bool) -> None:
-    """A field that is a hundredth longer than drawn looks the same, and places are as far off without another word."""
+    """A field that is 1 % longer than drawn looks the same, with the same errors of places and no other message."""
     camera = Camera((1280, 960), 700.0, (643.0, 475.0), Brown((-0.18, 0.05, 2e-4, -3e-4, 0.0)), aspect=aspect)
     world = {"camera": Station("camera", overhead_pose(0.2, -0.1, 5.2, 8.0, 3.0, yaw_deg=90.0))}
     scene = field_scene(ssl_field("B"), {"camera": camera}, world, points=(), spacing_m=0.1)

@@ -1,4 +1,4 @@
-"""What is cited is there: sections of the design, headings, files and links named in code and documents."""
+"""References are valid: sections of the design, headings, files and links named in code and documents."""
 
 import re
 from collections.abc import Iterator
@@ -28,12 +28,12 @@ def headings(path: Path) -> list[str]:
 
 
 def anchor(heading: str) -> str:
-    """As GitHub makes it."""
+    """The anchor that GitHub makes."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def cited(pattern: re.Pattern[str], paths: list[Path]) -> Iterator[tuple[str, str]]:
-    """Where something is cited, and what."""
+    """Places of citations, and what they cite."""
     for path in paths:
         text = path.read_text(encoding="utf-8")
         for found in pattern.finditer(text):
@@ -63,7 +63,7 @@ def test_files() -> None:
 
 @each_document
 def test_modules(path: Path) -> None:
-    """`room/module.py` stands below the package, `module.py` somewhere in it or on top."""
+    """`room/module.py` must exist below the package, `module.py` anywhere in it or at the top."""
     package = ROOT / "src/ceres_cal"
     missing = [f"{where}: {name}" for where, name in cited(IN_ROOM, [path]) if not (package / name).exists()]
     names = {module.name for module in CODE}

@@ -1,4 +1,4 @@
-"""What the documents say to type works, in the order in which it stands, and prints what they say."""
+"""The commands in the documents work in their order, and print the output that is shown."""
 
 import re
 import shlex
@@ -13,13 +13,13 @@ from ceres_cal.cli.terminal import chosen
 from data import documents
 
 CODE = re.compile(r"^```(?:console|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-# The others take a minute together, and say to type much of the same.
+# The others take a minute together, and repeat many commands.
 EACH_TIME = [path for path in DOCUMENTS if path.stem in ("README", "accuracy", "options", "scale")]
 INLINE = re.compile(r"`(ceres-cal [^`]+)`")
 
 
 def typed(text: str) -> list[list[str]]:
-    """Every call of ceres-cal in a document that is written out in full, as the program gets its arguments."""
+    """Every complete call of ceres-cal in a document, as the program gets its arguments."""
     lines = [line for block in CODE.findall(text) for line in block.replace("\\\n", " ").splitlines()]
     calls = [call for line in lines for call in re.split(r"\|\|?|&&|;", line) if "ceres-cal " in call]
     calls = [call[call.index("ceres-cal ") :] for call in calls if re.match(r"\s*(\$ )?ceres-cal ", call)]
@@ -41,7 +41,7 @@ def test_every_command_that_is_named_is_one(path: Path) -> None:
 
 
 def complaint(arguments: list[str]) -> str:
-    """Nothing of what can be run; "required" of what is only named, with an option or without."""
+    """An empty text for calls that can be run; "required" for commands that are only named, perhaps with an option."""
     command, rest = chosen(arguments)
     try:
         command.parse(rest)

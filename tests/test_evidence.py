@@ -1,4 +1,4 @@
-"""One evidence of random effects, against the dense Gaussian likelihood that it stands for."""
+"""The evidence of random effects, compared with the dense Gaussian likelihood."""
 
 from dataclasses import dataclass, replace
 
@@ -36,7 +36,7 @@ SEEDS = st.integers(0, 10_000)
 
 
 def drawn(seed: int, equations: int = 30, free: int = 4, numbers: int = 5) -> tuple[Array, Array, Array]:
-    """A projector (E, E) onto what the free numbers leave, columns (E, Q) and residuals (E,)."""
+    """A projector (E, E) onto the complement of the free numbers, columns (E, Q) and residuals (E,)."""
     rng = np.random.default_rng(seed)
     taken = np.linalg.qr(rng.standard_normal((equations, free)))[0]
     return (
@@ -47,7 +47,7 @@ def drawn(seed: int, equations: int = 30, free: int = 4, numbers: int = 5) -> tu
 
 
 def basis_of(left: Array) -> Array:
-    """(E, E - free) orthonormal, of what a projector leaves."""
+    """(E, E - free) orthonormal basis of the range of a projector."""
     values, vectors = np.linalg.eigh(left)
     return np.asarray(vectors[:, values > 0.5])
 
@@ -55,7 +55,7 @@ def basis_of(left: Array) -> Array:
 def restricted(
     left: Array, columns: Array, residuals: Array, covariance: Array, freedom: int | None, basis: Array | None = None
 ) -> float:
-    """Logarithm of the restricted likelihood, written down: the density of what the free numbers leave."""
+    """Logarithm of the restricted likelihood: the density of the residuals after the free numbers."""
     basis = basis_of(left) if basis is None else basis
     whole = np.eye(basis.shape[1]) + basis.T @ columns @ covariance @ columns.T @ basis
     squares = float(basis.T @ residuals @ np.linalg.solve(whole, basis.T @ residuals))
@@ -72,7 +72,7 @@ def effects_of(left: Array, columns: Array, residuals: Array, known_noise: bool)
 
 @given(SEEDS, st.booleans(), st.floats(0.0, 3.0), st.floats(0.0, 5.0))
 def test_evidence_is_the_restricted_likelihood(seed: int, known_noise: bool, scatter: float, size: float) -> None:
-    """Differences between hypotheses, as constants are left out."""
+    """Differences between hypotheses, since constants are left out."""
     left, columns, residuals = drawn(seed)
     root = size * np.random.default_rng(seed + 1).standard_normal((5, 2))
     found = effects_of(left, columns, residuals, known_noise)
@@ -102,7 +102,7 @@ def test_amounts_are_the_posterior_mean_and_standard_deviation(seed: int, scatte
 
 
 def test_likeliest_sizes_are_the_maximum_of_the_evidence() -> None:
-    """Without the one direction that counts along (least 0 does not take it away): of many numbers it is little."""
+    """With least 0; for many numbers the difference of one degree of freedom is small."""
     rng = np.random.default_rng(3)
     columns, truth = rng.standard_normal((600, 120)), np.repeat([0.3, 2.0], 60) * rng.standard_normal(120)
     seen = columns @ truth + rng.standard_normal(600)
@@ -138,7 +138,7 @@ def test_sum_of_logarithms_far_below_zero() -> None:
 
 @dataclass(frozen=True)
 class LinearisedCase:
-    """A calibration's linear model, and the same written down: what the free numbers leave (E, E), and residuals."""
+    """A calibration's linear model, and the same in dense form: projector of the free numbers (E, E), and residuals."""
 
     model: Linearised
     case: Case
@@ -175,7 +175,7 @@ def seen() -> LinearisedCase:
 
 
 def test_a_line_aside(seen: LinearisedCase) -> None:
-    """Log odds of each line, with every size of its offset and of the scatter of all written down."""
+    """Log odds of each line, with all sizes of its offset and of the scatter summed explicitly."""
     model, equations = seen.model, seen.model.equations
     _, group = grouped(equations.view * 100 + equations.feature, equations.is_curve)
     few = np.where(group < 5, group, -1)
@@ -198,7 +198,7 @@ def test_a_line_aside(seen: LinearisedCase) -> None:
 
 
 def test_a_bent_board(seen: LinearisedCase) -> None:
-    """How probable its bows are, and how large."""
+    """The probability and the size of its bows."""
     model, prior = seen.model, SizePrior(0.5, (1e-4, 3e-4, 1e-3))
     columns = (seen.model.equations.built[:, 2:4] * model.weight[:, None]) * ~model.equations.is_curve[:, None]
     bows = SparseColumns.of_groups(model, columns, np.zeros(len(columns), dtype=np.int64), 1)
@@ -213,7 +213,7 @@ def test_a_bent_board(seen: LinearisedCase) -> None:
 
 
 def test_a_rough_lens(seen: LinearisedCase) -> None:
-    """The likeliest size of waves along the radius is where the same likelihood, of known noise, is largest."""
+    """The likeliest size of waves along the radius maximises the dense likelihood with known noise."""
     offsets = half_diagonals(seen.case.estimate.cameras["overhead"], seen.model.equations.pixel)
     radius = np.linalg.norm(offsets, axis=1)
     outward = np.sum(seen.model.equations.direction * offsets, axis=1) / radius
@@ -229,7 +229,7 @@ def test_a_rough_lens(seen: LinearisedCase) -> None:
 
 
 def test_correlated_errors() -> None:
-    """Errors along curves are an effect on every row, whose covariance falls off with the distance."""
+    """Errors along curves are an effect on every row, with a covariance that decreases with the distance."""
     observations = simulate(overhead(frames=1, boards=0), NOISE, 3).observations
     half = np.arange(len(observations.curves)) % 2 == 0
     seen = linearised(observations.part(np.zeros(len(observations.points), bool), half))
@@ -246,7 +246,7 @@ def test_correlated_errors() -> None:
 
 
 def test_the_probability_of_a_diagnostic(seen: LinearisedCase) -> None:
-    """A score test asks the amounts of the largest likelihood: those under a size without bounds."""
+    """A score test gives the amounts with the largest likelihood: those with an unbounded size."""
     for effect in (EFFECTS["skew"], EFFECTS["decentring"], EFFECTS["curve aside"]):
         (columns,) = effect.columns(seen.case)
         for score in score_all(seen.model, [EffectSums.of(seen.model, columns)])[:4]:

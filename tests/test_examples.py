@@ -1,4 +1,4 @@
-"""The examples run as they are, and what they print is right."""
+"""The examples run unchanged, and their output is right."""
 
 import json
 import os
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def said(name: str, *arguments: str) -> str:
-    """What an example prints, in a process of its own."""
+    """The output of an example, run as its own process."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     call = [sys.executable, str(ROOT / "examples" / name), *arguments]
     return subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout

@@ -1,4 +1,4 @@
-"""How lines lie beside their drawing, and dimensions that are others: told apart, named, refused."""
+"""Displaced lines, and other dimensions: distinguished, named, refused."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +48,7 @@ CAMERA = Camera(
 
 
 def measured(painted: Target, noise_px: float = 0.1) -> Lines:
-    """Lines that are painted so, as they would be measured."""
+    """Measured lines of this field."""
     course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)
     offset = np.random.default_rng(3).normal(0.0, noise_px, len(course))
     every = np.ones(len(course), dtype=bool)
@@ -56,12 +56,12 @@ def measured(painted: Target, noise_px: float = 0.1) -> Lines:
 
 
 def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> FieldAsBuilt:
-    """What they tell of the field that is asked for."""
+    """The result for the field that is asked for."""
     return as_built(measured(painted, noise_px), CAMERA, asked, unknown_optics(CAMERA, None).priors)
 
 
 def moved(aside_m: dict[str, tuple[float, float]], field: Target = FIELD) -> Target:
-    """The field with some of its lines elsewhere."""
+    """The field with some of its lines moved."""
     curves = dict(field.curves)
     for name, (x, y) in aside_m.items():
         line = curves[name]
@@ -89,7 +89,9 @@ def test_lines_that_lie_aside_are_named_and_measured() -> None:
 
 
 def test_lines_that_are_bent_as_by_no_lens_are_another_field_s() -> None:
-    """As when the camera is bent until a field of another width fits in parts; tape that wanders does less."""
+    """For example a camera that is bent until parts of a field of another width fit; tape that is not straight does
+    less.
+    """
     course = predict(FIELD, CAMERA, FIELD.curve_names, 8.0, 8.0)
     every = np.ones(len(course), dtype=bool)
     for wave_px, wander_m, is_other in ((0.15, 0.0, False), (0.35, 0.004, False), (1.0, 0.013, True)):
@@ -137,7 +139,7 @@ def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None
 
 
 def test_a_stated_length_that_everything_else_contradicts_is_named() -> None:
-    """The whole field 1 % larger than asked for, its lengths stated to 2 cm: areas and circle say how large it is."""
+    """The field is 1 % larger than asked for, with lengths stated to 2 cm: areas and circle determine its size."""
     lines = measured(ssl_field("B", field_length_m=9.09, field_width_m=6.06))
     seen = observations_of(FIELD, CAMERA.image_size, lines.course.curve, lines.pixels, lines.sigma_px)
     lengths = {"field_length_m": 9.0, "field_width_m": 6.0}
@@ -150,8 +152,8 @@ def test_a_stated_length_that_everything_else_contradicts_is_named() -> None:
 
 
 def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
-    """Lines aside by 4 mm of a field 12 mm longer and 9 mm narrower: errors are 3.0 of what is stated by its drawing,
-    .58 so.
+    """Lines displaced by 4 mm on a field 12 mm longer and 9 mm narrower: with the drawing the error is 3.0 times the
+    stated one, with free dimensions 0.58 times.
     """
     rng = np.random.default_rng(0)
     painted = ssl_field("B", field_length_m=9.012, field_width_m=5.991)
@@ -179,8 +181,8 @@ def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
 
 
 def test_lines_scatter_by_what_all_likely_sizes_say() -> None:
-    """Not by the likeliest of sizes a factor of two apart: pitches that had lines 6 cm aside were trusted to half of
-    what they were off.
+    """Not the likeliest of sizes with factors of two between them: pitches with lines 6 cm off were trusted to half of
+    their error.
     """
     laid_m, found = 0.0045, []
     for seed in range(16):
@@ -196,7 +198,7 @@ def test_lines_scatter_by_what_all_likely_sizes_say() -> None:
 
 
 def test_an_offset_is_no_length() -> None:
-    """What is printed as a length to solve for is one; an offset is said to lie beside its drawing."""
+    """Only lengths are printed as lengths to solve for; an offset is reported as a displaced line."""
     seen = observations_of(FIELD, CAMERA.image_size, np.zeros(1, int), np.full((1, 2), 99.0), np.ones(1))
     priors = (Prior.of_offset("field", "HalfwayLine", 0.04), Prior("target", "field", "field_width_m", (5.9,), (0.1,)))
     detections = FieldDetections(replace(seen, priors=priors), {}, (), {})

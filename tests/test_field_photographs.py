@@ -1,4 +1,4 @@
-"""From photographs of a field to its observations: lines, crossings, far starts, clicks, and misses that say so."""
+"""From photographs of a field to observations: lines, crossings, far initial cameras, clicks, and reported misses."""
 
 import json
 from collections.abc import Callable
@@ -110,7 +110,7 @@ def test_a_mosaic_of_colours_draws_no_line_aside(tmp_path: Path) -> None:
 
 
 def of_slanted_lines(places: Array) -> Scene:
-    """A small camera over thin lines that rise by 1 to 4 degrees, from these places (N,), m, on."""
+    """A small camera above thin lines that rise by 1 to 4 degrees, starting at these places (N,), m."""
     angles = np.deg2rad(np.linspace(1.0, 4.0, len(places)))
     lines = {
         f"line {k}": Segment((-6.0, y, 0.0), (6.0, y + 12.0 * np.tan(angle), 0.0), 0.03)
@@ -128,7 +128,7 @@ def course_in(scene: Scene) -> Course:
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_moved_camera_draws_no_line_aside(turned: bool) -> None:
-    """Seven pixels across the lines: what looks for them first must be as even as what measures them then."""
+    """Lines that are 7 px off: the search must have no bias, like the measurement that follows."""
     scene = of_slanted_lines(np.linspace(-5.0, 3.0, 6))
     picture = light(photograph(scene, "overhead", "0001", Photography(carpet_texture=0.02), 1).image)
     course = course_in(scene)
@@ -140,7 +140,9 @@ def test_a_moved_camera_draws_no_line_aside(turned: bool) -> None:
 
 
 def test_what_windows_cannot_know_is_added_to_their_sigmas() -> None:
-    """Paint thinner than a pixel, sampled without blur: errors of a tenth of a pixel, alike over several places."""
+    """Paint thinner than a pixel, sampled without blur: errors of a tenth of a pixel, correlated
+    over several places.
+    """
     scene = of_slanted_lines(np.linspace(-5.0, 4.0, 12))
     dim = np.linspace(0.2, 1.0, 320)[None, :, None]  # windows on the right know much better than those on the left
     picture = photograph(scene, "overhead", "0001", Photography(blur_px=0.0, vignetting=0.0, read_noise=0.0), 1).image
@@ -178,7 +180,9 @@ def test_crossings_lie_where_branches_meet(shot: script.Shot) -> None:
 
 
 def test_where_places_scatter_more_than_stated_so_do_crossings(shot: script.Shot) -> None:
-    """One place in eight is ten standard deviations aside, as where worn paint ends: the spread is still as stated."""
+    """One place in eight is ten sigmas off, as at the end of worn paint; the spread still agrees
+    with the stated one.
+    """
     found, rng, pulls = follow(shot.grey, FIELD, [shot.camera], FIELD.curve_names), np.random.default_rng(1), []
     for _ in range(20):
         noise = rng.standard_normal(len(found.lines.course)) * np.where(
@@ -193,7 +197,7 @@ def test_where_places_scatter_more_than_stated_so_do_crossings(shot: script.Shot
 
 @pytest.mark.thorough
 def test_far_starts_arrive() -> None:
-    """Five degrees off."""
+    """An initial camera five degrees off."""
     shot, angle = script.take(9), float(np.deg2rad(script.OFF_DEG))
     found = follow(shot.grey, FIELD, [script.off_by(shot.camera, angle, 9)], FIELD.curve_names)
     assert found.holds
@@ -223,7 +227,7 @@ def test_edges_say_the_same_as_middles(tmp_path: Path, shot: script.Shot) -> Non
 
 
 def test_lines_darker_than_the_floor(tmp_path: Path, shot: script.Shot) -> None:
-    """A negative shows the same field, of which the second photograph is looked at as the first one was."""
+    """A negative shows the same field; the second photograph is searched with the polarity of the first."""
     paths = [saved(shot, tmp_path), tmp_path / "dark.png", tmp_path / "again.png"]
     for path in paths[1:]:
         cv2.imwrite(str(path), 255 - shot.picture.image)
@@ -255,7 +259,7 @@ def test_either_sign_is_looked_for_where_both_have_strokes() -> None:
 
 @pytest.mark.parametrize("shape", [disturbed.drawn_out, disturbed.comatic])
 def test_coma_moves_no_line(shot: script.Shot, shape: Callable[[], tuple[Array, Array]]) -> None:
-    """By the mean of the light lines stay where they are; an even profile has them .6 px inwards at the rim."""
+    """The mean of the light defines the line; a symmetric profile displaces it by 0.6 px inwards at the rim."""
     drawn_out = disturbed.with_coma(shot.picture.image, shot.camera, 9.0, shape())
     course = predict(FIELD, shot.camera, FIELD.curve_names, SPACING_PX, SPACING_PX)
     clear = clear_px(FIELD, shot.camera, course, FIELD.curve_names)
@@ -328,7 +332,7 @@ def small() -> disturbed.DisturbedShot:
 
 
 def test_another_place_is_told_apart(tmp_path: Path, small: disturbed.DisturbedShot) -> None:
-    """A camera that was moved, or another one: what most pictures show is kept, in any order."""
+    """A camera that was moved, or another one: the majority of the pictures is kept, in any order."""
     moved = cv2.warpAffine(small.image, np.array([[1.0, 0.0, 10.0], [0.0, 1.0, 0.0]]), small.image.shape[1::-1])
     paths = [tmp_path / f"{name}.png" for name in ("moved", "first", "second")]
     for path, image in zip(paths, (moved, small.image, small.image), strict=True):
@@ -353,7 +357,7 @@ def test_pictures_that_show_too_little_are_taken_together(tmp_path: Path, shot: 
 
 
 def wide(tilt_deg: float, phi: float) -> tuple[Scene, Camera]:
-    """A fisheye above the whole of a division A field, with corners of it up to 70 degrees from its axis."""
+    """A fisheye above the whole of a division A field, whose corners are up to 70 degrees from its axis."""
     field = ssl_field("A")
     optics = Camera((1280, 960), phi, (650.0, 477.0), KannalaBrandt((-0.06, -0.0083, 0.0, 0.0)))
     pose = overhead_pose(-1.33, 0.87, 4.6, 0.0, tilt_deg, 3.0)
@@ -363,7 +367,7 @@ def wide(tilt_deg: float, phi: float) -> tuple[Scene, Camera]:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_clicks_of_a_fisheye_start_near(seed: int) -> None:
-    """Of six right ones one was said to lie a thousand pixels from where the others have it."""
+    """One of six correct clicks was reported as a thousand pixels from the place predicted by the others."""
     (scene, camera), rng = wide(8.0, 525.0), np.random.default_rng(seed)
     field = scene.targets["field"]
     shown = camera.project(field.point_array)
@@ -375,7 +379,9 @@ def test_clicks_of_a_fisheye_start_near(seed: int) -> None:
 
 
 def test_a_fisheye_shows_the_field_that_is_drawn(tmp_path: Path) -> None:
-    """It was said to be 8 % longer: a simpler lens had ends of lines elsewhere, and what was found there held on."""
+    """It was reported as 8 % longer: a simpler lens predicted ends of lines elsewhere, and its
+    detections confirmed it.
+    """
     scene, camera = wide(22.0, 525.0)
     path, field = tmp_path / "wide.png", scene.targets["field"]
     cv2.imwrite(str(path), photograph(scene, "camera", "0001", seed=1).image)

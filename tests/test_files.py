@@ -1,4 +1,4 @@
-"""Files: one line that names the file, and the old file or the new one whatever happens."""
+"""Files: errors in one line that names the file, and always either the old or the new file on disk."""
 
 import errno
 import io
@@ -148,13 +148,13 @@ def test_what_is_no_file_of_ours_is_refused(tmp_path: Path, content: bytes, mess
 
 
 def test_numbers_that_are_not_finite_reach_the_checks() -> None:
-    # As Python's own writer spells them: only the checks behind can say whose number it is.
+    # As Python's own writer writes them: only later checks know which number it is.
     assert [str(v) for v in parse_json(b"[NaN, Infinity, -Infinity]", "here")] == ["nan", "inf", "-inf"]
 
 
 @pytest.mark.parametrize("letter", ["a", "é", "\\u4e2d"])
 def test_plain_letters_take_a_byte_of_memory_each(letter: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    # The posterior of a board of 484 corners as built is 70 MB of digits, which 512 MB hold.
+    # The posterior of a board of 484 corners as built has 70 MB of digits, for which 512 MB are enough.
     monkeypatch.setenv("CERES_CAL_MOST_MB", "1")
     content = f'["{letter}{"a" * 300_000}"]'.encode()
     if letter == "a":

@@ -1,4 +1,4 @@
-"""Observations in a folder of columns: the same to the last bit, and no more of them in memory than a block."""
+"""Observations in a folder of columns: the same to the last bit, with at most one block in memory."""
 
 from __future__ import annotations
 

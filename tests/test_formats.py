@@ -1,4 +1,4 @@
-"""The table of export formats: a format that nobody has heard of is exported to like the built-in ones."""
+"""The table of export formats: a new format is exported to like the built-in ones."""
 
 import json
 from functools import cache
@@ -21,7 +21,7 @@ def write_toy(
     digits: Annotated[int, "after the point"] = 3,
     comment: Annotated[str, "what to say of it"] = "",
 ) -> Export:
-    """phi of each station's camera, to so many digits; what was there before stays on top."""
+    """phi of each station's camera with so many digits; the previous content stays above."""
     cameras = {name: request.calibration.station(name) for name in request.stations}
     lines = [f"{name} {camera.phi:.{digits}f}" for name, camera in cameras.items()]
     lines = [comment, *lines] if comment else lines
@@ -63,7 +63,7 @@ def test_from_python(tmp_path: Path) -> None:
     phi = calibrated().station().phi
     assert (tmp_path / "a.toy").read_text() == f"overhead {phi:.1f}"
     assert exported.losses[0].field_mm[0.15] == (0.3, 0.4) and exported.warnings == ("toys break",)
-    export(calibrated(), "toy", tmp_path / "a.toy", ["overhead"], digits=0)  # it edits what is there
+    export(calibrated(), "toy", tmp_path / "a.toy", ["overhead"], digits=0)  # it edits the existing file
     assert (tmp_path / "a.toy").read_text() == f"overhead {phi:.1f}overhead {phi:.0f}"
     export(calibrated(), "folder", tmp_path / "many")
     assert (tmp_path / "many" / "overhead.txt").read_bytes() == b"here"

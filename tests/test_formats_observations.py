@@ -1,4 +1,4 @@
-"""Observations out of the files of others."""
+"""Observations imported from other programs' files."""
 
 import base64
 import io
@@ -59,7 +59,7 @@ SPREADSHEET = TABLE.replace(",", ";").replace(".", ",").replace("100;50", "100,0
     "table", [TABLE, "\ufeff" + TABLE.replace("\n", "\r\n"), SPREADSHEET, SPREADSHEET.replace(";", "\t")]
 )
 def test_named_columns(tmp_path: Path, table: str) -> None:
-    """Whatever a spreadsheet puts between them."""
+    """With any separator that spreadsheets use."""
     (tmp_path / "a.csv").write_text(table, newline="")
     seen = import_observations(tmp_path / "a.csv", target="ssl-b", image_size="640x480")
     assert [view.frame for view in seen.views] == ["1", "2"] and seen.views[0].placement is None
@@ -70,7 +70,7 @@ def test_named_columns(tmp_path: Path, table: str) -> None:
 
 
 def test_places_far_from_their_origin_stay_apart(tmp_path: Path) -> None:
-    """Rounded to six digits, places of a survey had one name: all but the last were lost."""
+    """Rounded to six digits, places of a survey had one name, and all but the last were lost."""
     places = [(412345.25 + 0.5 * n, 5765432.75) for n in range(4)]
     rows = [f"{100 * n},50,{x},{y}" for n, (x, y) in enumerate(places)]
     (tmp_path / "a.csv").write_text("\n".join(["x_px,y_px,X_m,Y_m", *rows]))

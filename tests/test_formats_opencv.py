@@ -19,7 +19,7 @@ EXACT = ("brown", "kannala-brandt", "brown-rational", "brown-all")
 
 
 def projected(path: Path, points: Array, number: str = "") -> Array:
-    """By OpenCV, from what OpenCV reads."""
+    """Projection by OpenCV with the file as OpenCV reads it."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix = storage.getNode(f"M{number}" if number else "camera_matrix").mat()
     distortion = storage.getNode(f"D{number}" if number else "distortion_coefficients").mat()
@@ -103,7 +103,7 @@ def test_a_radial_lens_comes_back_as_a_rational_one(tmp_path: Path) -> None:
 
 
 def test_skew_is_lost_in_opencv_and_said(tmp_path: Path) -> None:
-    """`cv2.projectPoints` does not look at K's second number."""
+    """`cv2.projectPoints` ignores K's second number."""
     camera = replace(with_lens("brown"), skew=2e-3)
     (loss,) = export(over_field(camera), "opencv", tmp_path / "a.yml").losses
     assert loss.image_px is not None and loss.image_px[1] > 0.1
@@ -132,7 +132,7 @@ def test_to_and_from_opencv() -> None:
 
 
 def test_what_sees_across_is_a_fisheye() -> None:
-    """Up to 106 degrees from the axis, by a lens that OpenCV does not have."""
+    """Up to 106 degrees from the axis, with a lens that OpenCV does not have."""
     lens = make_lens("spline", coefficients={"rim": 800.0, "g11": 2.0, "p1": 1.0})
     camera = Camera((1280, 960), 300.0, (640.0, 480.0), lens)
     found = camera.to_opencv()
@@ -141,7 +141,7 @@ def test_what_sees_across_is_a_fisheye() -> None:
 
 
 def test_a_decentred_fisheye_is_what_comes_nearer() -> None:
-    """OpenCV's fisheye has no decentring: up to 60 degrees its rational model, which has, comes nearer."""
+    """OpenCV's fisheye has no decentring: up to 60 degrees its rational model, which has it, fits better."""
     lens = make_lens("kannala-brandt", coefficients={"k1": 0.05, "k2": 0.01, "p1": 4e-3, "p2": -3e-3})
     camera = Camera((1280, 960), 800.0, (640.0, 480.0), lens)
     found = camera.to_opencv()
@@ -222,7 +222,7 @@ def test_too_many_stations_are_refused(tmp_path: Path) -> None:
 
 
 def test_elements_within_elements_by_the_thousand_are_refused(tmp_path: Path) -> None:
-    """OpenCV reads them by recursion: the process died."""
+    """OpenCV reads them by recursion, and the process crashed."""
     text = '<?xml version="1.0"?>\n<opencv_storage>\n' + "<extrinsic_parameters>\n" * 40_000
     (tmp_path / "deep.xml").write_text(text)
     with pytest.raises(InputError, match="more than 32 elements within each other"):

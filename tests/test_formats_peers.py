@@ -1,4 +1,4 @@
-"""ROS, Kalibr, mrcal, COLMAP and the paper: read back by their own programs or libraries, and there and back again."""
+"""ROS, Kalibr, mrcal, COLMAP and the paper: read by their own programs or libraries, and exact round trips."""
 
 import json
 import os
@@ -151,7 +151,7 @@ print(json.dumps([mrcal.project(seen, *model.intrinsics()).tolist(), [int(s) for
 
 
 def in_mrcal(path: Path, points: Array) -> tuple[Array, list[int]]:
-    """By mrcal's own reader and projection, in the Python that $CERES_CAL_MRCAL names, or the system's."""
+    """Projection by mrcal's own reader in the Python that $CERES_CAL_MRCAL names, or the system's."""
     python = os.environ.get("CERES_CAL_MRCAL", "/usr/bin/python3")
     ask = [python, "-c", _MRCAL, str(path)]
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
@@ -177,7 +177,7 @@ def test_mrcal_by_itself(lens: str, tmp_path: Path) -> None:
 
 
 def test_a_camera_that_sees_behind_itself_in_a_model_of_tangents(tmp_path: Path) -> None:
-    """It is fitted by what the model can show, which is the field: 1.7 mm off at most, where it was metres off."""
+    """The fit uses what the model can show, which is the field: at most 1.7 mm error, where it was metres."""
     camera = replace(with_lens(KannalaBrandt((0.0,) * 4)), phi=437.0)  # corners 107 degrees off the axis
     (loss,) = export(over_field(camera), "mrcal", tmp_path / "a.cameramodel").losses
     assert max(worst for _, worst in loss.field_mm.values()) < 3.0
@@ -192,7 +192,9 @@ def test_a_camera_that_sees_behind_itself_in_a_model_of_tangents(tmp_path: Path)
 
 
 def test_a_fisheye_is_fitted_by_all_that_it_shows() -> None:
-    """Corners 102 degrees off the axis and a decentring that it has not: 8.2 px off at most, 12 by what is ahead."""
+    """Corners 102 degrees from the axis, and decentring, which it lacks: 8.2 px at most, 12 px with only the front
+    half.
+    """
     lens = make_lens("kannala-brandt", coefficients={"k1": -0.02, "p1": 0.002, "p2": -0.001})
     assert ForeignCamera.of(replace(with_lens(lens), phi=480.0), FISHEYE).error_px[1] < 8.5
 
@@ -317,7 +319,7 @@ def test_yaml_that_means_no_good(text: str, words: str, tmp_path: Path) -> None:
 
 
 def test_yaml_in_base_60_is_text() -> None:
-    """As in YAML 1.2; added up as numbers, 2.5 MB of it took 38 s, by the square of their length."""
+    """As in YAML 1.2; as numbers, 2.5 MB took 38 s, quadratic in their length."""
     assert read_yaml("a: 1:30:00\nb: 0x10\nc: -12\n") == {"a": "1:30:00", "b": 16, "c": -12}
     begin = time.process_time()
     long = "1" + ":1" * 150_000
@@ -326,7 +328,7 @@ def test_yaml_in_base_60_is_text() -> None:
 
 
 def test_like_images_of_a_model_of_colmap_stay_apart(tmp_path: Path) -> None:
-    """A folder for each camera: 0001.jpg of the second one took the place of the first."""
+    """A folder for each camera: 0001.jpg of the second camera replaced that of the first."""
     export(two_cameras("brown"), "colmap", tmp_path)
     images = tmp_path / "images.txt"
     images.write_text(images.read_text().replace("camera0", "left/1.jpg").replace("camera1", "right/1.jpg"))
@@ -334,7 +336,7 @@ def test_like_images_of_a_model_of_colmap_stay_apart(tmp_path: Path) -> None:
 
 
 def test_a_model_of_colmap_is_of_regular_files(tmp_path: Path) -> None:
-    """The library itself would wait for a pipe's writer for ever."""
+    """The library itself would wait for ever for the writer of a pipe."""
     os.mkfifo(tmp_path / "cameras.txt")
     with pytest.raises(InputError, match="a pipe or a device"):
         import_calibration(tmp_path, "colmap")

@@ -1,5 +1,5 @@
-"""ssl-vision's and vision-processor's formats: decoded by google.protobuf from the published field numbers, used by
-their published equations, and sent over the loopback.
+"""ssl-vision's and vision-processor's formats: decoded by google.protobuf with the published field numbers, used with
+their published equations, and sent over the loopback interface.
 """
 
 import re
@@ -74,7 +74,7 @@ def published(name: str) -> Any:
 
 
 def rotation(calib: Any) -> Array:
-    """Eigen's of a quaternion x, y, z, w."""
+    """Eigen's rotation matrix of a quaternion x, y, z, w."""
     x, y, z, w = calib.q0, calib.q1, calib.q2, calib.q3
     return np.array(
         [
@@ -107,7 +107,7 @@ def image_to_field(calib: Any, pixels: Array, height_mm: float) -> Array:
 
 
 def shown_on_field(calibration: Calibration, height_m: float) -> tuple[Array, Array]:
-    """Pixels on the field and where they are, m."""
+    """Pixels on the field and their places, m."""
     camera = calibration.station()
     true = np.random.default_rng(3).uniform((-4.5, -3.0), (4.5, 3.0), (3000, 2))
     pixels = camera.project(np.column_stack([true, np.full(len(true), height_m)]))
@@ -117,7 +117,7 @@ def shown_on_field(calibration: Calibration, height_m: float) -> tuple[Array, Ar
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_our_packet_calibrates_vision_processor(lens: str, tmp_path: Path) -> None:
-    """It looks for its own camera id in any packet, and takes what it finds."""
+    """It searches any packet for its own camera id, and uses that entry."""
     calibration = over_field(with_lens(lens))
     packet, exported = ssl_packet(calibration, camera_id="3")
     wrapper = published("Wrapper").FromString(packet)
@@ -141,7 +141,7 @@ def test_our_packet_calibrates_vision_processor(lens: str, tmp_path: Path) -> No
 
 
 def test_what_loses_less_is_named(tmp_path: Path) -> None:
-    """A lens that one coefficient does not hold: OpenCV's model does."""
+    """For a lens that one coefficient cannot describe, OpenCV's model is recommended."""
     exported = export(over_field(with_lens(KannalaBrandt((-0.03, 0.002, 0.0, 0.0)))), "ssl-vision", tmp_path / "a.pb")
     worst = max(worst for _, worst in exported.losses[0].field_mm.values())
     (said,) = [text for text in exported.warnings if "one coefficient cannot describe this lens" in text]
@@ -156,7 +156,7 @@ def test_a_negative_distortion_is_said_out_loud(tmp_path: Path) -> None:
 
 
 def test_geometry_yml_parses_as_vision_processor_parses_it(tmp_path: Path) -> None:
-    """By json_format.ParseDict, into the published message."""
+    """With json_format.ParseDict, into the published message."""
     export(two_cameras(SSL_LENS), "vision-processor", tmp_path / "geometry.yml")
     given = yaml.safe_load((tmp_path / "geometry.yml").read_text())
     assert {line["type"] for line in given["field"]["field_lines"]} <= {*ssl_field("B").curves}
@@ -209,7 +209,9 @@ def test_saved_calibrations_of_tournaments(real_data: Path, tmp_path: Path) -> N
 
 
 def same_calib(given: list[dict[str, Any]], written: list[dict[str, Any]], *, exact: bool) -> bool:
-    """Every number that was given, to the last digit, or in a new file to float32 with a quaternion of either sign."""
+    """Every number that was given, to the last digit, or for a new file to float32 with either sign
+    of the quaternion.
+    """
     for before, after in zip(given, written, strict=True):
         turned = np.sign(sum(before[f"q{n}"] * after[f"q{n}"] for n in range(4)))
         for name, value in before.items():
@@ -292,7 +294,7 @@ def test_what_ssl_vision_would_clamp_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture
 def loopback() -> Group:
-    """A group on a port of its own: who joins a group hears all who send to it, the senders of other tests too."""
+    """A multicast group with its own port, since members of a group also receive packets of other tests."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("", 0))
         return Group("224.5.23.9", free.getsockname()[1], "127.0.0.1")
@@ -324,7 +326,7 @@ def test_published_and_heard_over_the_loopback(
 
 
 def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float, group: Group) -> Any:
-    """What is received while each packet is sent to an address again and again."""
+    """What is received while each packet is sent repeatedly to an address."""
     ends = threading.Event()
 
     def send() -> None:
@@ -344,7 +346,7 @@ def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float, group: G
 
 
 def no_field() -> bytes:
-    """A packet of two cameras over a field of negative length."""
+    """A packet of two cameras above a field with negative length."""
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
     data = from_bytes("SSL_WrapperPacket", packet)
     data["geometry"]["field"]["field_length"] *= -1

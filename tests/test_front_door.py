@@ -1,4 +1,4 @@
-"""From arrays to a calibration and back in a few lines, as someone types them who knows OpenCV."""
+"""From arrays to a calibration and back in a few lines, as users of OpenCV type them."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ TRUE = Camera((1280, 960), 900.0, (650.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0
 
 
 def corners(count: int = 8) -> list[Array32]:
-    """OpenCV's arrays, one a frame, noise 0.1 px."""
+    """OpenCV's arrays, one for each frame, with 0.1 px noise."""
     draw, seen = np.random.default_rng(2), []
     for _ in range(count):
         turn = draw.uniform(-0.5, 0.5, 3)
@@ -63,7 +63,7 @@ def test_places_frames_and_what_was_not_seen() -> None:
 
 @pytest.mark.parametrize("given", [np.ones((4, 2)), [np.ones((480, 640, 3))], 7])
 def test_what_are_no_photographs(given: Any) -> None:
-    """Pixels, or images that were read, given to `check` ended in a ValueError of NumPy."""
+    """Pixels, or images that were read, given to `check` caused a ValueError of NumPy."""
     with pytest.raises(InputError, match=r"photographs must be file names, not \w+;"):
         image_files(given)
 
@@ -77,7 +77,7 @@ def test_a_field_is_named_as_on_the_command_line() -> None:
 
 
 def test_names_from_arrays_are_text() -> None:
-    """`np.array(["left"])[0]` is text to Python, and ended in a TypeError of the file that is made of it."""
+    """`np.array(["left"])[0]` is a str subclass, and caused a TypeError when the file was written."""
     name, frame = np.array(["left", "0001"])
     field = ssl_field(np.array(["B"])[0])
     seen = Observations.from_points({frame: np.ones((len(field.points), 2))}, field, (640, 480), camera=name)

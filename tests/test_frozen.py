@@ -1,4 +1,4 @@
-"""Frozen data: what is given once does not change, and is equal to itself alone."""
+"""Frozen data: immutable, and by default equal only to itself."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Size(Frozen, eq=True):
 
 
 class ColouredRing(Ring, kw_only=True):
-    """With a number that is given by name."""
+    """A ring with a keyword-only number."""
 
     colour: int
 
@@ -77,13 +77,13 @@ def test_it_is_a_dataclass_to_everybody() -> None:
 
 
 def test_what_a_file_leaves_out_is_the_default() -> None:
-    """msgspec writes no default into an instance: it is its class's."""
+    """msgspec stores no default in an instance; it is found in the class."""
     read = msgspec.convert({"width": 2}, Size)
     assert read == Size(2) and repr(read) == repr(Size(2)) and replace(read, width=3) == Size(3)
 
 
 def test_a_default_is_a_value_of_the_class() -> None:
-    """`run` of a folder of cameras asks its class for what nobody asked for, and found none."""
+    """`run` for a folder of cameras reads defaults from its class, and found none."""
 
     class NameHolder(Frozen):
         name: str = field(default="ring", metadata={"help": "what it is called"})

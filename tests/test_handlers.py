@@ -1,4 +1,4 @@
-"""No error is swallowed without a word: each handler after which the work goes on says what the user then reads."""
+"""No error is swallowed silently: each handler after which work continues states what the user then reads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "src" / "ceres_cal"
 SAID = re.compile(r'# (reads: "[^"]{3,}"|quiet: .{10,})')
-MOST = 45  # there are so many; one more needs one less elsewhere
+MOST = 45  # the present number; a new one must replace another
 GOES_ON = (ast.Return, ast.Continue, ast.Break)
 
 
@@ -21,7 +21,7 @@ def nodes(text: str) -> tuple[ast.AST, ...]:
 
 
 def handlers(text: str) -> Iterator[ast.ExceptHandler | ast.With]:
-    """Those after which the work may go on, and each `with suppress(...)`."""
+    """Handlers after which work may continue, and each `with suppress(...)`."""
     for node in nodes(text):
         if isinstance(node, ast.ExceptHandler):
             inside = [part for statement in node.body for part in ast.walk(statement)]
@@ -32,7 +32,7 @@ def handlers(text: str) -> Iterator[ast.ExceptHandler | ast.With]:
 
 
 def comments_of(lines: list[str], node: ast.ExceptHandler | ast.With) -> str:
-    """On its line, on the one above, or on the lines between it and what it does."""
+    """Comments on its line, on the line above, or before its first statement."""
     return "\n".join(lines[node.lineno - 2 : node.body[0].lineno])
 
 
@@ -45,7 +45,7 @@ def attempts(text: str) -> Iterator[ast.Call | ast.Name]:
             yield from (one for one in node.decorator_list if isinstance(one, ast.Name) and one.id == "or_none")
 
 
-# kernels/ is left out: what it kept in a cache is replaced as a whole.
+# kernels/ is left out: its cache is replaced as a whole.
 FOUND = [
     (path, path.read_text(encoding="utf-8"))
     for path in sorted(SOURCES.rglob("*.py"))

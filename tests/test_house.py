@@ -1,4 +1,4 @@
-"""The house: imports go downwards only, heavy libraries have one door each, and modules stay small."""
+"""The structure: imports go downwards only, heavy libraries are imported in few packages, and modules are small."""
 
 import ast
 import subprocess
@@ -14,7 +14,7 @@ PACKAGE = "ceres_cal"
 SRC = Path(__file__).parents[1] / "src"
 MAX_LINES = 450
 
-# A new module, or a package with all that is in it, is one line here.
+# Each module, or package with its contents, has one line here.
 FLOORS = {
     "base": 0,
     "kernels": 1,
@@ -37,7 +37,7 @@ FLOORS = {
     "__main__": 14,
 }
 
-# Library: who may import it, at the top or inside a function.
+# Library: packages that may import it, at the top or inside a function.
 DOORS = {
     "pyceres": {"problem"},
     "cv2": {"detect", "report", "formats", "scene"},  # scene: what the markers of a printed board look like
@@ -58,7 +58,7 @@ def dotted(path: Path) -> str:
 
 
 def room(name: str) -> str:
-    """ceres_cal.detect.boards -> detect: what FLOORS and DOORS speak of"""
+    """ceres_cal.detect.boards -> detect: the names in FLOORS and DOORS"""
     return (name + ".").split(".")[1]
 
 
@@ -83,7 +83,7 @@ MODULES = {dotted(path): path for path in sorted((SRC / PACKAGE).rglob("*.py"))}
 
 
 def module_of(target: str) -> str | None:
-    """ceres_cal.detect.boards.find -> ceres_cal.detect.boards; None for what is not ours (or not yet there)"""
+    """ceres_cal.detect.boards.find -> ceres_cal.detect.boards; None for other packages, and for missing modules"""
     while target and target not in MODULES:
         target = target.rpartition(".")[0]
     return target or None
@@ -97,7 +97,7 @@ def test_imports_go_downwards() -> None:
 def require_downwards(name: str) -> None:
     floor = FLOORS.get(room(name))
     assert floor is not None, f"{name} has no floor: give it a line in FLOORS (design: floor 0 knows nobody)"
-    stub = MODULES[name].with_suffix(".pyi")  # what a package hands on, loaded when it is asked for
+    stub = MODULES[name].with_suffix(".pyi")  # names that a package re-exports lazily
     for line, target in (*imports(MODULES[name]), *(imports(stub) if stub.exists() else ())):
         if target.split(".")[0] != PACKAGE:
             continue
@@ -144,7 +144,9 @@ def test_modules_stay_small() -> None:
 
 
 def test_class_names_are_nouns() -> None:
-    """A participle leaves open what it is of. "As built" and "linearised" are terms of the field (docs/design.md)."""
+    """A participle does not say what it describes. "As built" and "linearised" are terms of the
+    field (docs/design.md).
+    """
     classes = [
         node.name
         for folder in (SRC / PACKAGE, *(SRC.parent / name for name in ("scripts", "tests")))

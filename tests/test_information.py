@@ -1,4 +1,4 @@
-"""Information with named keys: adding up, holding, integrating out, and roots, of full rank or not."""
+"""Information with named keys: sums, fixed numbers, marginals, and roots, with full rank or not."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ seeds = st.integers(0, 2**31)
 
 
 def drawn(seed: int, count: int, rank: int | None = None, first: int = 0) -> Information:
-    """Of `count` numbers with units far apart, `rank` directions of them known."""
+    """`count` numbers with very different units, of which `rank` directions are known."""
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((2 * count if rank is None else rank, count)) * 10.0 ** rng.uniform(-3, 3, count)
     return Information(KEYS[first : first + count], rows.T @ rows)
@@ -47,7 +47,7 @@ def test_the_marginal_is_the_inverse_of_a_part_of_the_covariance(seed: int, coun
 
 @given(seeds, sizes, st.data())
 def test_given_is_the_marginal_of_the_inverse(seed: int, count: int, data: st.DataObject) -> None:
-    """What holding does to an information matrix, integrating out does to its inverse, and the other way round."""
+    """Fixing numbers in an information matrix is marginalising its inverse, and the other way round."""
     known = drawn(seed, count)
     covariance = Information(known.keys, inverse(known.matrix))
     keys = data.draw(st.lists(st.sampled_from(known.keys), min_size=1, unique=True))
@@ -57,7 +57,7 @@ def test_given_is_the_marginal_of_the_inverse(seed: int, count: int, data: st.Da
 
 @given(seeds, seeds, sizes, st.data())
 def test_the_marginal_of_a_sum(seed: int, other: int, count: int, data: st.DataObject) -> None:
-    """What speaks of the kept numbers alone may be added before or after the others are integrated out."""
+    """Information about the kept numbers only may be added before or after marginalisation."""
     known = drawn(seed, count)
     keys = data.draw(st.lists(st.sampled_from(known.keys), min_size=1, unique=True))
     added = Information(tuple(keys), drawn(other, len(keys)).matrix) if len(keys) > 1 else known.given(keys)
@@ -85,7 +85,7 @@ def test_a_root_is_one_of_a_singular_matrix_too(seed: int, count: int, singular:
 
 @given(seeds, st.integers(3, 6), st.floats(1.0, 1e6))
 def test_shifts_however_large_leave_information(seed: int, count: int, far: float) -> None:
-    """Where hardly anything is known, rounding gave numbers imaginary standard deviations."""
+    """Where almost nothing is known, rounding gave numbers imaginary standard deviations."""
     known = drawn(seed, count, rank=count - 2)
     steps = far * np.random.default_rng(seed).standard_normal((2, count)) / np.sqrt(np.diagonal(known.matrix))
     wider = known.widened(steps)
@@ -158,12 +158,12 @@ def test_directions_of_which_nothing_is_known(seed: int, count: int, data: st.Da
     projection = known.inverse @ known.matrix
     assert np.trace(projection) == pytest.approx(rank, abs=1e-6)
     assert close(known.matrix @ projection, known.matrix, 1e-6)
-    # Where more is unknown than is integrated out, nothing is left to know of the others.
+    # If more directions are unknown than are marginalised, nothing is known of the others.
     assert known.marginal(known.keys[: max(1, count - rank)]).known_rank <= rank
 
 
 def test_one_direction_of_numbers_far_apart() -> None:
-    """Whose plain inverse is rounding that adds up to nothing."""
+    """The plain inverse is dominated by rounding, and its product has no trace."""
     known = drawn(504336568, 3, 1)
     assert np.trace(known.inverse @ known.matrix) == pytest.approx(1.0, abs=1e-9)
 
@@ -178,7 +178,7 @@ def test_nothing() -> None:
 
 
 def test_only_the_sum_of_two_numbers_is_known() -> None:
-    """Integrating one of them out leaves nothing of the other; holding it leaves all."""
+    """Marginalising one leaves nothing of the other; fixing it leaves all."""
     known = Information(KEYS[:3], 25.0 * np.outer([1.0, 1.0, 0.0], [1.0, 1.0, 0.0]) + np.diag([0.0, 0.0, 4.0]))
     assert known.known_rank == 2
     assert known.without(KEYS[:1]).matrix == pytest.approx(np.diag([0.0, 4.0]), abs=1e-12)

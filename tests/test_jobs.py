@@ -1,4 +1,4 @@
-"""Five jobs in at most twelve lines of Python each: they run as they are, and type checkers accept them."""
+"""Five jobs with at most twelve lines of Python each: they run unchanged, and type checkers accept them."""
 
 import os
 import shutil
@@ -27,7 +27,7 @@ def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def said(as_script: Callable[..., str]) -> Callable[..., str]:
-    """What a job prints."""
+    """The output of a job."""
 
     def run(name: str, *arguments: object, folder: Path = ROOT) -> str:
         return as_script(JOBS / f"{name}.py", *arguments, folder=folder)
@@ -41,7 +41,7 @@ JobOutput = Callable[..., str]
 def test_each_is_short() -> None:
     lines = {path.stem: len(path.read_text(encoding="utf-8").splitlines()) for path in sorted(JOBS.glob("*.py"))}
     assert list(lines) == NAMES
-    assert {name: count for name, count in lines.items() if count > MOST_LINES + 1} == {}  # and what it is, above
+    assert {name: count for name, count in lines.items() if count > MOST_LINES + 1} == {}  # plus its docstring
 
 
 def test_corners_of_opencv(said: JobOutput) -> None:

@@ -1,4 +1,4 @@
-"""The compiled kernels against the readable lens models, brute force, differences and the uncompressed problem."""
+"""The compiled kernels, compared with plain lens models, brute force, differences and the uncompressed problem."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ TARGET = custom(
 
 
 Shown = tuple[PointColumns, CurveColumns]
-"""What one camera sees of one frame, as the kernels take it; the feet are where their search begins."""
+"""Observations of one camera in one frame, in the form of the kernels' arguments; searches start at the feet."""
 
 
 def shown(
@@ -87,20 +87,21 @@ def singles(seen: Shown) -> list[Shown]:
 
 
 def with_points(seen: Shown, **columns: Any) -> Shown:
-    """Some other columns of the points."""
+    """The same with other columns of the points."""
     return seen[0]._replace(**columns), seen[1]
 
 
 def fresh(curves: CurveColumns) -> CurveColumns:
-    """Columns whose feet may be moved."""
+    """Columns whose feet may be changed."""
     return curves._replace(feet=curves.feet.copy())
 
 
 @cache
 def looked_at(lens: str) -> tuple[Camera, Shown]:
-    """A leaning camera with pixels that are not square, and what it sees: points, lines and arcs, every side, 2 px off.
+    """A tilted camera with pixels that are not square, and its observations: points, lines and arcs, all sides, 2 px
+    noise.
 
-    About a hundred curve observations: more than one chunk, and not a whole number of them.
+    There are about a hundred curve observations: more than one chunk, and not a whole number of chunks.
     """
     rng = np.random.default_rng(4)
     height = 3.2 if lens.startswith("kannala-brandt") else 5.2
@@ -131,7 +132,7 @@ def matrix(pose: Pose) -> Array:
 def normal_equations(
     camera: Camera, seen: Shown, loss: str = "trivial", scale: float = 1.0, *, structure: int = 0, newton: bool = False
 ) -> tuple[float, Array]:
-    """Sum of rho, and A over [intrinsics | structure | 6 pose | residual], whole."""
+    """Sum of rho, and the full matrix A over [intrinsics | structure | 6 pose | residual]."""
     optics = camera_optics(camera)
     count = len(optics.intrinsics)
     size = count + structure + 7
@@ -151,14 +152,14 @@ def point_residuals(camera: Camera, seen: Shown) -> Array:
 
 
 def curve_residuals(camera: Camera, seen: Shown) -> tuple[Array, Array]:
-    """Distances px, and the feet they were measured at."""
+    """Distances px, and the feet at which they are measured."""
     found, curves = np.empty(len(seen[1].pixels)), fresh(seen[1])
     kernels.curve_residuals(camera_optics(camera), matrix(camera.cam_from_world)[None], curves, found)
     return found, curves.feet
 
 
 def residual_vector(camera: Camera, seen: Shown) -> Array:
-    """Every residual in its sigmas: x and y of the points, then the curves' distances."""
+    """All residuals in sigmas: x and y of the points, then the distances of the curves."""
     points = point_residuals(camera, seen) * seen[0].weights[:, None]
     return np.concatenate([points.ravel(), curve_residuals(camera, seen)[0] * seen[1].weights])
 
@@ -203,7 +204,7 @@ def test_point_residuals_are_those_of_the_readable_lens(lens: str) -> None:
 
 
 def foot_by_search(camera: Camera, seen: Shown, row: int) -> tuple[float, float]:
-    """Signed distance from a pixel to its curve and the foot, by minimising over the projected curve alone."""
+    """Signed distance from a pixel to its curve, and the foot, by minimisation along the projected curve."""
     track, is_arc, start = (
         seen[1].tracks[seen[1].track[row]],
         bool(seen[1].is_arc[seen[1].track[row]]),
@@ -225,14 +226,14 @@ def foot_by_search(camera: Camera, seen: Shown, row: int) -> tuple[float, float]
 def test_curve_residuals_are_true_distances(lens: str) -> None:
     camera, seen = looked_at(lens)
     distances, places = curve_residuals(camera, seen)
-    assert np.std(distances) > 1.0  # 2 px of noise: the feet are not where the pixels are
+    assert np.std(distances) > 1.0  # 2 px of noise: the feet differ from the pixels
     brute = np.array([foot_by_search(camera, seen, row) for row in range(len(distances))])
     assert np.max(np.abs(distances - brute[:, 0])) < 1e-10  # 3e-13 px measured
-    assert np.max(np.abs(places - brute[:, 1])) < 1e-6  # 6e-8 measured: the search knows its foot no better
+    assert np.max(np.abs(places - brute[:, 1])) < 1e-6  # 6e-8 measured: the tolerance of the search
 
 
 def test_far_pixels_have_the_nearest_foot_too() -> None:
-    """Gross errors: pixels tens of px off the centre circle, some of them on the far side of a sharp bend."""
+    """Gross errors: pixels tens of px from the centre circle, some of them beyond a sharp bend."""
     camera, seen = looked_at("radial-2-3")
     rows = np.flatnonzero(seen[1].is_arc[seen[1].track])
     seen = take(seen, curves=rows)
@@ -248,7 +249,7 @@ def test_far_pixels_have_the_nearest_foot_too() -> None:
 
 
 def jacobian_by_gradients(camera: Camera, seen: Shown) -> Array:
-    """Jacobian (residuals, numbers) read off single observations: the last row of A is e J, whatever e is.
+    """Jacobian (residuals, numbers) from single observations: the last row of A is e J for any e.
 
     A point's pixel is moved so that its residual is (1, 0), then (0, 1).
     """
@@ -266,7 +267,7 @@ def jacobian_by_gradients(camera: Camera, seen: Shown) -> Array:
 
 @each_lens
 def test_every_residual_knows_its_derivatives(lens: str) -> None:
-    """Points against the readable lens model, curves against their own distance with the foot searched anew."""
+    """Points compared with the plain lens model, curves with their own distance after a new search for the foot."""
     camera, seen = looked_at(lens)
     found = jacobian_by_gradients(camera, seen)
 
@@ -278,14 +279,14 @@ def test_every_residual_knows_its_derivatives(lens: str) -> None:
 
     steps = np.concatenate([intrinsics_steps(camera), POSE_STEPS])
     error = np.abs(found - np.vstack([derivative(project, steps), derivative(distance, steps)]))
-    error /= np.maximum(np.max(np.abs(found), axis=0), 1e-12)  # nothing is seen by some of a spline's numbers
+    error /= np.maximum(np.max(np.abs(found), axis=0), 1e-12)  # some of a spline's numbers have no effect
     moved_once = [
         intrinsic_names(camera.lens).index(name) for name in camera.lens.set_at_start if name in camera.lens.names
     ]
-    error = np.delete(error, moved_once, axis=1)  # its knots: differences across them are not so smooth
+    error = np.delete(error, moved_once, axis=1)  # at its knots differences are less smooth
     points = 2 * len(seen[0].places)
     assert np.max(error[:points]) < 5e-8  # 6e-9 measured
-    curved = 2e-6 if lens == "spline" else 1e-7  # of the first B-spline the foot is no straight function
+    curved = 2e-6 if lens == "spline" else 1e-7  # the foot is not linear in the first B-spline
     assert np.max(error[points:]) < curved  # 1e-8 measured, 9e-7 of the spline
 
 
@@ -299,7 +300,7 @@ def test_normal_equations_sum_up_single_observations(lens: str, loss: str) -> No
     assert cost == pytest.approx(sum(part[0] for part in parts), rel=1e-12)  # 1e-14 measured
     total = np.sum([part[1] for part in parts], axis=0)
     size = np.sqrt(np.outer(np.diag(total), np.diag(total)))
-    # A foot that is 1e-9 px off is good enough for both, but not the same one.
+    # A foot with an error of 1e-9 px is accurate enough for both, but the two feet differ.
     assert np.max(np.abs(normal - total) / size) < 1e-8  # 4e-10 measured
 
 
@@ -336,7 +337,7 @@ def test_losses_are_those_of_ceres(loss: str, length: float, scale: float) -> No
         expected = scale**2 / 3.0 * (1.0 - rest**3), rest**2
     else:
         expected = (LOSSES[loss]() if loss == "trivial" else LOSSES[loss](scale)).evaluate(s)[:2]
-    assert rho == pytest.approx(expected[0], rel=1e-6)  # 9e-8 measured: pyceres hands s over in single precision
+    assert rho == pytest.approx(expected[0], rel=1e-6)  # 9e-8 measured: pyceres passes s in single precision
     assert weighted == pytest.approx(expected[1] * s, rel=1e-6, abs=1e-12)
 
 
@@ -346,14 +347,15 @@ def test_losses_are_concave_enough_for_the_extra_row(loss: str, length: float, s
     """rho >= rho' s: without it the block's last row would be the root of a negative number (design, section 6)."""
     rho, weighted, s = loss_of(loss, scale, length)
     assert rho >= weighted * (1.0 - 1e-13)  # 2e-14 measured where the compiler optimises little
-    # s is evaluated apart, and a compiler may contract that otherwise: both round pixels of up to 591 px, a residual
-    # thus by one epsilon of it at most (0.17 measured where the compiler optimises little), its root and square by 10.
+    # s is evaluated separately, and a compiler may contract that differently. Both round pixels of up to 591 px: an
+    # error of one epsilon of this in the residual (0.17 measured with little optimisation), and of 10 in its root and
+    # square.
     rounding = np.finfo(float).eps * np.array([591.0, 10.0])
     assert 0.0 <= weighted <= (np.sqrt(s) + rounding[0]) ** 2 * (1.0 + rounding[1])
 
 
 def bent(loss: str, squared: float, scale: float) -> float:
-    """1 + 2 s rho'' / rho' at the squared residual s, not below what keeps the step short."""
+    """1 + 2 s rho'' / rho' at the squared residual s, with the lower limit that keeps the step short."""
     if loss == "huber":
         return 1.0 if squared <= scale**2 else 0.01
     return 1.0 / (1.0 + squared / scale**2) if loss == "soft_l1" else 1.0
@@ -362,7 +364,7 @@ def bent(loss: str, squared: float, scale: float) -> float:
 @each_lens
 @each_loss
 def test_newtons_step_takes_the_bend_of_the_loss_along(lens: str, loss: str) -> None:
-    """The gradient stays; what each residual adds to A shrinks along it by 1 + 2 s rho'' / rho'."""
+    """The gradient is unchanged; the part of each residual in A decreases along it by 1 + 2 s rho'' / rho'."""
     camera, seen = looked_at(lens)
     plain, newton = (normal_equations(camera, seen, loss, 4.0, newton=newton)[1] for newton in (False, True))
     size = np.sqrt(np.diag(plain))
@@ -378,7 +380,7 @@ def test_newtons_step_takes_the_bend_of_the_loss_along(lens: str, loss: str) -> 
 
 
 def test_where_most_are_outliers_the_loss_stays_straight() -> None:
-    """There its bend says nothing of where the minimum lies, and a step along it would be very long."""
+    """There the loss's curvature does not describe the minimum, and a Newton step would be very long."""
     camera, seen = looked_at("brown")
     far = (
         seen[0]._replace(pixels=seen[0].pixels + 50.0),
@@ -393,7 +395,7 @@ def test_where_most_are_outliers_the_loss_stays_straight() -> None:
 
 @dataclass(frozen=True)
 class Block:
-    """What Ceres gets: the Jacobian's columns in the order camera, station, placement, structure."""
+    """The block given to Ceres: columns of the Jacobian in the order camera, station, placement, structure."""
 
     residuals: Array
     jacobian: Array
@@ -403,7 +405,7 @@ def evaluate_block(
     camera: Camera, poses: tuple[Array, Array], seen: Shown, loss: str = "trivial", scale: float = 1.0, *,
     free: Indices | None = None, held: tuple[str, ...] = (), structure: int = 0,
 ) -> Block | None:  # fmt: skip
-    """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
+    """The block of a camera at station @ placement; None where the kernel reports no result."""
     optics = camera_optics(camera)
     free = np.arange(len(optics.intrinsics)) if free is None else free
     rows = len(free) + structure + 7
@@ -421,7 +423,9 @@ def evaluate_block(
 def uncompressed(
     camera: Camera, poses: tuple[Array, Array], seen: Shown, loss: str, scale: float
 ) -> tuple[float, Array, Array]:
-    """Sum of rho, Newton's matrix and J^T W e of the problem with one row per residual, its Jacobian by differences."""
+    """Sum of rho, Newton's matrix and J^T W e of the problem with one row per residual and a
+    Jacobian by differences.
+    """
     count = len(intrinsics_vector(camera))
 
     def residuals(change: Array) -> Array:
@@ -446,7 +450,7 @@ def uncompressed(
 
 
 def split(camera: Camera, rotation: Array, *, turned: str) -> tuple[Array, Array]:
-    """The camera's pose as station @ placement where one of them has this rotation vector."""
+    """The camera's pose as station @ placement, where one of the two has this rotation vector."""
     given = Pose.exp([*rotation, 0.3, -0.2, 0.5])
     if turned == "station":
         return np.array([*rotation, 0.3, -0.2, 0.5]), (given.inverse @ camera.cam_from_world).log()
@@ -455,11 +459,11 @@ def split(camera: Camera, rotation: Array, *, turned: str) -> tuple[Array, Array
 
 AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
 ANGLES = [0.0, 1e-9, 0.99e-4, 1.01e-4, 0.7, 2.5, np.pi - 1e-6, np.pi, 4.0]
-"""Around the switch to the series at 1e-4, around pi where the logarithm turns over, and past it, as steps may go."""
+"""Near the switch to the series at 1e-4, near pi where the logarithm jumps, and beyond it, where steps may lead."""
 
 
 def assert_same_problem(block: Block, problem: tuple[float, Array, Array]) -> None:
-    """Cost, gradient, J^T J and the damped step of a block are those of the uncompressed problem."""
+    """Cost, gradient, J^T J and damped step of a block equal those of the uncompressed problem."""
     cost, normal, gradient = problem
     assert block.residuals @ block.residuals == pytest.approx(cost, rel=1e-12)  # 2e-14 measured
     size = np.sqrt(np.diag(normal))
@@ -521,7 +525,7 @@ def test_fixed_intrinsics_have_no_column(free: list[int]) -> None:
     assert block.residuals @ block.residuals == pytest.approx(whole.residuals @ whole.residuals, rel=1e-12)
 
 
-@pytest.mark.parametrize("lens", scenes.LENSES)  # of a rational lens the squares of so few are beyond rounding
+@pytest.mark.parametrize("lens", scenes.LENSES)  # few observations: a rational lens's squares round away
 @pytest.mark.parametrize("what", ["one point", "one place on a line", "residuals of zero"])
 def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
     """Zero pivots: fewer residuals than numbers, and a last column that is zero."""
@@ -537,8 +541,8 @@ def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
     cost, normal, gradient = uncompressed(camera, poses, seen, "trivial", 1.0)
     size = np.maximum(np.sqrt(np.diag(normal)), 1e-3)
     assert block.residuals @ block.residuals == pytest.approx(cost, rel=1e-9, abs=1e-18)
-    # Without pivoting, rounding in what is open grows by |A11^-1 A12|^2 (Higham, Accuracy and Stability, section 10.3):
-    # 7e-9 measured, and 2e-6 of four radial powers without vectors.
+    # Without pivoting, rounding in undetermined directions grows by |A11^-1 A12|^2 (Higham, Accuracy and Stability,
+    # section 10.3): 7e-9 measured, and 2e-6 for four radial powers without vectors.
     assert np.max(np.abs(block.jacobian.T @ block.jacobian - normal) / np.outer(size, size)) < 1e-5
     found = block.jacobian.T @ block.residuals
     assert np.max(np.abs(found - gradient) / size) < 1e-7 * np.sqrt(cost) + 1e-10  # 7e-9 measured
@@ -546,7 +550,7 @@ def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
 
 @each_lens
 def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
-    """Where the radius is 0 no lens bends anything: the coefficients' columns are 0 and nothing is divided by it."""
+    """At radius 0 no lens has distortion: the columns of the coefficients are 0, without a division by 0."""
     camera = replace(scenes.camera(lens), aspect=1.03)
     seen = with_points(
         take(looked_at(lens)[1], points=slice(0, 1)), places=np.array([[0.0, 0.0, 2.0]]), pixels=np.zeros((1, 2))
@@ -566,7 +570,7 @@ def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
 
 
 def everything_moves(seen: Shown) -> tuple[Shown, int]:
-    """A number for x and y of each point, two bows that all share, the offset of each segment, x, y, radius of arcs."""
+    """Numbers for x and y of each point, two common bows, the offset of each segment, and x, y, radius of arcs."""
     points = len(TARGET.points)
     slots = np.full((points, kernels.BUILT), -1)
     slots[:, :4] = np.column_stack(
@@ -582,7 +586,7 @@ def everything_moves(seen: Shown) -> tuple[Shown, int]:
 
 
 def as_built(seen: Shown, values: Array) -> Shown:
-    """The target with the structure numbers put in: points along x and y, their bows along z, segments to the left."""
+    """The target with these structure numbers: points moved along x and y, bows along z, segments to the left."""
     slots = seen[0].slots
     bowed = np.sum(seen[0].bends[:, :2] * values[slots[:, 2:4]], axis=1)
     shift = np.column_stack([values[slots[:, :2]], bowed])
@@ -600,7 +604,7 @@ def as_built(seen: Shown, values: Array) -> Shown:
 
 @pytest.mark.parametrize("lens", scenes.LENSES)
 def test_structure_knows_its_derivatives(lens: str) -> None:
-    """J^T J and J^T e with the structure's numbers, against differences of every residual."""
+    """J^T J and J^T e with the structure's numbers, compared with differences of all residuals."""
     camera, seen = looked_at(lens)
     seen, structure = everything_moves(seen)
     count, total = len(intrinsics_vector(camera)), len(intrinsics_vector(camera)) + structure
@@ -632,8 +636,8 @@ def test_structure_knows_its_derivatives(lens: str) -> None:
 
 
 def test_what_a_chunk_says_nothing_of_is_left_out_of_it_alone() -> None:
-    """A surface's nodes, each shown by few observations, beside the structure's numbers: summed up one by one, where
-    nearly all rows are left out, and at once.
+    """A surface's nodes, each with few observations, and the structure's numbers: summed one by one, with nearly all
+    rows left out, and all at once.
     """
     camera, seen = looked_at("spline-surface")
     seen, structure = everything_moves(seen)
@@ -660,7 +664,7 @@ def test_what_a_chunk_says_nothing_of_is_left_out_of_it_alone() -> None:
 def eliminate(
     camera: Camera, poses: list[Pose], parts: list[Shown], loss: str, tolerance: float
 ) -> tuple[float, Array, list[Pose]]:
-    """Sum of rho at the best poses, the complement over [intrinsics | residual], whole, and those poses."""
+    """Sum of rho at the best poses, the full complement over [intrinsics | residual], and those poses."""
     optics = camera_optics(camera)
     count = len(optics.intrinsics)
     stack, costs = np.stack([matrix(pose) for pose in poses]), np.empty(len(parts))
@@ -681,7 +685,7 @@ def eliminate(
 
 
 def three_sights(lens: str) -> tuple[Camera, list[Pose], list[Shown]]:
-    """Thirds of the observations, as if of three placements whose poses are 10 mm and 10 mrad off."""
+    """Thirds of the observations, as of three placements whose poses have errors of 10 mm and 10 mrad."""
     camera, seen = looked_at(lens)
     rng = np.random.default_rng(8)
     parts = [take(seen, points=slice(None), curves=slice(k, None, 3)) for k in range(3)]
@@ -692,7 +696,9 @@ def three_sights(lens: str) -> tuple[Camera, list[Pose], list[Shown]]:
 @each_lens
 @pytest.mark.parametrize("loss", ["trivial", "huber", "cauchy"])
 def test_eliminated_poses_are_the_best_ones(lens: str, loss: str) -> None:
-    """At the poses that come back each sight's gradient with respect to its pose is 0, and the cost is that there."""
+    """At the returned poses the gradient of each sight with respect to its pose is 0, and the cost
+    is the cost there.
+    """
     camera, starts, parts = three_sights(lens)
     cost, reduced, poses = eliminate(camera, starts, parts, loss, 0.0)
     count = len(intrinsics_vector(camera))
@@ -712,7 +718,7 @@ def test_eliminated_poses_are_the_best_ones(lens: str, loss: str) -> None:
 
 @pytest.mark.parametrize("loss", ["trivial", "soft_l1"])
 def test_eliminated_gradient_is_that_of_the_best_cost(loss: str) -> None:
-    """Against differences of the cost minimised anew: what Ceres takes for the derivative is one."""
+    """Compared with differences of the minimised cost: Ceres gets a true derivative."""
     camera, starts, parts = three_sights("radial-2-3")
     _, reduced, poses = eliminate(camera, starts, parts, loss, 0.0)
 
@@ -726,13 +732,13 @@ def test_eliminated_gradient_is_that_of_the_best_cost(loss: str) -> None:
 
 
 def test_eliminating_loosely_is_right_to_second_order() -> None:
-    """A sight that is left a little off its best pose reports the cost and the pose it would have there."""
+    """A sight slightly off its best pose reports the cost and the pose at the optimum."""
     camera, starts, parts = three_sights("radial-2-3")
     exact, _, best = eliminate(camera, starts, parts, "trivial", 0.0)
     off = [Pose.exp([1e-5, -2e-5, 1e-5, 2e-5, 1e-5, -3e-5]) @ pose for pose in best]
     cost, _, poses = eliminate(camera, off, parts, "trivial", 1e-2)
     plain = sum(normal_equations(camera.at(pose), part)[0] for pose, part in zip(off, parts, strict=True))
-    assert plain - exact > 1e-6 * exact  # the offset shows
+    assert plain - exact > 1e-6 * exact  # the offset has an effect
     assert abs(cost - exact) < 1e-2 * (
         plain - exact
     )  # 1e-3 measured: Gauss and Newton's, not Newton's own second order
@@ -800,7 +806,7 @@ def test_a_pinhole_shows_what_is_far_off_its_axis(values: tuple[float, ...]) -> 
 
 
 def test_a_fisheye_sees_behind_itself() -> None:
-    """130 degrees from the axis, as far as its polynomial grows."""
+    """130 degrees from the axis, up to where its polynomial increases."""
     camera = Camera((1280, 960), 200.0, (640.0, 480.0), KannalaBrandt((0.01, 0.0, 0.0, 0.0)))
     points = rays(np.deg2rad(130.0), -np.deg2rad(100.0))
     seen = with_points(take(looked_at("brown")[1], points=slice(0, 2)), places=points, pixels=np.zeros((2, 2)))
@@ -822,7 +828,7 @@ def saddle_levels(numbers: Array, bends: Array, size: tuple[int, int]) -> Array:
 
 
 def saddle_start(x: float, y: float, first: float, other: float, bends: Array, radius: float) -> Array:
-    """(1, 14), its light and sharpness unknown."""
+    """(1, 14), with unknown light and sharpness."""
     return np.array([[x, y, first, other, *[np.nan] * 7, *bends, radius]])
 
 
@@ -842,7 +848,7 @@ def test_a_saddle_is_found_again(
     start, fitted = saddle_start(20.0, 20.0, turn + 0.1, turn + 1.3, bends, 14.0), np.empty((1, 14))
     kernels.fit_saddles(levels, start, fitted)
     assert fitted[0, :11] == pytest.approx(numbers, abs=1e-3)  # 3e-5, of float32's rounding
-    assert fitted[0, 11] < 5e-3  # 2e-3 where the last step, of which it is foretold, is the longest
+    assert fitted[0, 11] < 5e-3  # 2e-3 where the last step, from which it is predicted, is longest
     again, start[:, :11] = fitted.copy(), fitted[:, :11]
     kernels.fit_saddles(levels, start, again)
     assert again[0, :11] == pytest.approx(numbers, abs=1e-3)
@@ -856,7 +862,7 @@ def test_the_scatter_of_saddles_is_what_noise_makes_of_them() -> None:
     for own in found:
         kernels.fit_saddles((picture + rng.standard_normal(picture.shape)).astype(np.float32), start, own[None])
     assert np.std(found[:, :2], axis=0) == pytest.approx(np.mean(found[:, 12:], axis=0), rel=0.15)  # 4 % expected
-    assert np.mean(found[:, 11]) == pytest.approx(1.0, abs=0.05)  # 11 of 450 freedoms are taken
+    assert np.mean(found[:, 11]) == pytest.approx(1.0, abs=0.05)  # 11 of 450 degrees of freedom are used
 
 
 def test_no_saddle_is_looked_for_outside_of_a_picture() -> None:
@@ -871,7 +877,7 @@ def test_no_saddle_is_looked_for_outside_of_a_picture() -> None:
 
 @pytest.mark.parametrize("smear_px, lean", [(0.0, 0.0), (2.5, 0.7), (4.0, -1.0)])
 def test_the_equations_of_profiles_are_those_of_their_formula(smear_px: float, lean: float) -> None:
-    """Of `detect.profiles`, its smear a mean by quadrature, its derivatives differences; of more than one chunk."""
+    """The formula of `detect.profiles` with its smear by quadrature and derivatives by differences; several chunks."""
     rng, edges, heights = np.random.default_rng(1), np.array([-1.4, 1.3]), np.array([80.0, -70.0])
     distance, values = rng.uniform(-9.0, 9.0, 301), rng.uniform(0.0, 255.0, 301)
     nodes, weights = np.polynomial.legendre.leggauss(100)
@@ -901,7 +907,7 @@ def test_the_equations_of_profiles_are_those_of_their_formula(smear_px: float, l
 
 
 def test_how_many_strokes_run_along_a_floor() -> None:
-    """Of any number of them, also far off; none where hardly any run along one of the axes."""
+    """For any number of strokes, also distant ones; NaN or 0 where almost none are along one of the axes."""
     rng = np.random.default_rng(2)
     planes, axes, weights = rng.normal(0.0, 3.0, (3, 77)), rng.normal(0.0, 1.0, (40, 2, 3)), rng.random(77)
     along = np.exp(-((axes @ planes) ** 2))
@@ -913,7 +919,9 @@ def test_how_many_strokes_run_along_a_floor() -> None:
 
 
 def test_how_much_of_lines_is_near_strokes() -> None:
-    """From where a camera is, and from behind the lines, where it shows none; past the picture none counts."""
+    """From a camera's place, and from behind the lines, where nothing is seen; places outside the
+    picture do not count.
+    """
     upright, size, rng = Upright(-0.3, 1.2, np.eye(3), 1.0), (400, 300), np.random.default_rng(3)
     middle = 0.5 * (np.array(size) - 1.0)
     pixels = np.column_stack([np.linspace(-20.0, 420.0, 45), np.linspace(50.0, 250.0, 45)])
@@ -930,7 +938,7 @@ def test_how_much_of_lines_is_near_strokes() -> None:
 
 
 def test_the_normal_distribution_is_told_far_out() -> None:
-    """As far as there are numbers, of any shape."""
+    """To the smallest representable values, for arrays of any shape."""
     x = np.array([[-37.0, -8.0, -1.0], [0.0, 2.0, 9.0]])
     found = kernels.normal_cdf(x)
     assert np.allclose(found, norm.cdf(x), rtol=1e-12, atol=0.0)

@@ -1,4 +1,4 @@
-"""refit and check from photographs: the shipped ones, of a camera before and after it was knocked."""
+"""refit and check from photographs: the sample's, of a camera before and after it was knocked."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ KNOCKED = ROOT / "data" / "ssl_field_moved" / "photographs" / "0001.jpg"
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    """The sample camera, from two photographs of its field and four of boards, which are not those of the tests."""
+    """The sample camera from two photographs of its field and four of boards, which the tests do not use."""
     scene, _ = built_in_scene("ssl-field")
     field = detect_field([HOME / "0001.jpg", HOME / "0002.jpg"], scene.targets["field"], scene.camera_at("overhead"))
     boards = detect_boards([HOME / f"board_{i:02d}.jpg" for i in range(1, 5)], scene.targets["board"])
@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, calibration: Calibration) -
 
 
 def floor_error_mm(truth: Camera, found: Camera) -> float:
-    """How far off the floor is located, at worst, over the middle nine tenths of the image."""
+    """Largest error of places on the floor over the middle nine tenths of the image."""
     x, y = np.meshgrid(np.linspace(64.0, 1216.0, 15), np.linspace(48.0, 912.0, 12))
     pixels = np.column_stack([x.ravel(), y.ravel()])
     return float(np.max(1e3 * np.linalg.norm(found.locate(pixels) - truth.locate(pixels), axis=1)))
@@ -128,7 +128,7 @@ def test_what_cannot_be_looked_for(calibration: Calibration) -> None:
 
 
 def test_commands(say: Say, folder: Path) -> None:
-    """Of a moved camera and of a picture that shows nothing; docs/cron.md is tested, and has the others."""
+    """For a moved camera, and for a picture that shows nothing; the test of docs/cron.md has the others."""
     old = folder / "old.json"
     moved = say("check", old, KNOCKED, "--json")
     data = json.loads(moved.out)
@@ -171,7 +171,7 @@ def test_a_folder_of_photographs_is_kept_up_with(
 
 
 def test_the_report_says_what_a_photograph_says_of_its_floor() -> None:
-    """Which is flat: beforehand that it is bowed is as likely as one in five."""
+    """The floor is flat; the prior probability of a bowed one is one in five."""
     scene, _ = built_in_scene("ssl-field")
     seen = detect_field([NEW], scene.targets["field"], scene.camera_at("overhead")).observations
     calibration = calibrate(seen, RADIAL)

@@ -1,4 +1,4 @@
-"""Features that were seen under the name of another are named, and given their own."""
+"""Features that have the name of another one are named, and renamed."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_exchanged_names_are_found_and_mended(right: Observations, kind: str, fi
 
 
 def test_a_circle_of_another_radius_is_no_wrong_label() -> None:
-    """It was taken out as a whole; the two of its six rows that lie where it crosses a line were said to be of that."""
+    """It was rejected as a whole; two of its six rows, where it crosses a line, were attributed to that line."""
     drawn, station = ssl_field("B"), Station("c", overhead_pose(0.3, -0.2, 4.5, 6.0, -9.0))
     painted = ssl_field("B", center_circle_radius_m=0.55)
     scene = field_scene(painted, {"c": CAMERA}, {"c": station}, spacing_m=0.55)

@@ -1,4 +1,4 @@
-"""The league's set-ups: an answer, or one line that refuses. `scripts/run.py league` has all of them."""
+"""The league's set-ups: a calibration, or a refusal of one line. `scripts/run.py league` has all of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_each_two_values_come_together() -> None:
 
 
 SOME = [*pairwise()[1::2], pairwise()[6]]
-"""In which each value is there; the script's own run has the others."""
+"""Every value occurs in one of them; the script runs the others."""
 
 
 def test_each_value_is_tried() -> None:
@@ -27,7 +27,7 @@ def test_each_value_is_tried() -> None:
 
 @pytest.mark.parametrize("set_up", partly(SOME, [one for one in SOME if one.lens != "brown" or one.boards]), ids=str)
 def test_an_answer_or_one_honest_line(set_up: SetUp) -> None:
-    """No traceback, no warning of NumPy; nothing "known" over 5 sd off, nor wider than it was stated. Five seconds are
-    the script's to ask: a test that shares its processors has no clock.
+    """No traceback, no warning of NumPy, no "known" number with an error over 5 sd or wider than it was stated. The
+    limit of five seconds is tested by the script, since tests share their processors.
     """
     assert outcome(set_up, 0, most_seconds=np.inf).fault == ""

@@ -1,4 +1,4 @@
-"""The lens models: there and back, where they end, and the same numbers as OpenCV, COLMAP and ssl-vision."""
+"""The lens models: inverse maps, limits, and the same numbers as OpenCV, COLMAP and ssl-vision."""
 
 from collections.abc import Callable
 from typing import Any
@@ -58,7 +58,7 @@ def lenses(draw: st.DrawFn, decentring: float = 2e-3) -> tuple[Lens, float]:
 
 
 def valid_radius(lens: Lens, phi: float) -> float:
-    """How far (px) a test may go: nearly to where the lens ends, or 1.5 phi for one that never does."""
+    """The largest radius (px) of a test: nearly up to where the lens ends, or 1.5 phi for one that never does."""
     return min(0.97 * lens.monotone_radius(phi), 1.5 * phi)
 
 
@@ -66,7 +66,9 @@ def valid_radius(lens: Lens, phi: float) -> float:
 
 
 def test_decentring_of_the_papers_lens_is_browns_own() -> None:
-    """From the measured point to the ideal one, as the radius goes, by his formula; the compiled map is its inverse."""
+    """From the measured to the ideal point, like the radial part, by Brown's formula; the compiled
+    map is its inverse.
+    """
     lens, phi, unit = Radial((2e-4, 1e-6, 0.006, -0.008), (2, 3), ("tangential",)), 390.0, 486.0
     measured = polar(np.linspace(5.0, 400.0, 30))
     (x, y), r = measured.T, np.linalg.norm(measured, axis=1)
@@ -103,12 +105,12 @@ def test_round_trip_from_rays_of_any_length(drawn: tuple[Lens, float], length: f
     assert np.abs(back - rays).max() < 1e-14  # rad; measured 2.0e-15
 
 
-# A lens for which Newton once ran in a circle, and one for which it once ended half way when it started at the rim.
+# A lens for which Newton's method once did not end, and one for which it stopped half way when started at the rim.
 CIRCLING = (
     Brown((0.3696602911999488, 0.23772868894562144, -0.001024502834884153, 0.0009761263523310101, -0.0283)),
     1000.0,
 )
-# Near its pole a place is found to the last digit before its image is.
+# Near its pole a place is accurate to the last digit earlier than its image.
 POLE = Brown((-0.0116, 0.1295, 0.0094, 1e-5, 0.0, 0.0094, -0.1616, 3e-4, 1e-5, 0.0123, 0.0, 0.0), ("rational", "prism"))
 RIM = Radial((8.528542732914017e-06, -1.274056190889818e-10), (3, 5)), 202.0
 
@@ -137,26 +139,26 @@ def test_a_ray_has_its_own_pixel_or_none(drawn: tuple[Lens, float], seed: int) -
     rays = np.random.default_rng(seed).normal(size=(2000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     if lens.kind != "kannala-brandt":
-        rays = rays[rays[:, 2] > 0.1]  # 84 degrees from the axis: a power of 7 of what is farther out is no picture
+        rays = rays[rays[:, 2] > 0.1]  # 84 degrees from the axis: with a power of 7 there is no picture beyond
     offsets = lens.distort(rays, phi)
     rays, offsets = rays[np.isfinite(offsets[:, 0])], offsets[np.isfinite(offsets[:, 0])]
     back = lens.undistort(offsets, phi)
     found = np.isfinite(back[:, 0])
-    assert np.all(found | (np.hypot(*offsets.T) > 0.9 * lens.monotone_radius(phi)))  # Newton may give up at the rim
+    assert np.all(found | (np.hypot(*offsets.T) > 0.9 * lens.monotone_radius(phi)))  # it may fail at the rim
     off = np.abs(back - rays)[found]
     assert off.max(initial=0.0) < 1e-7  # rad; the square root of rounding at the rim, measured 9e-10
 
 
 # ---- where a lens ends ----------------------------------------------------------------------------------------------
 
-ENDING: list[tuple[Lens, float, float]] = [  # lens, phi, the measured radius at which the derivative vanishes, by hand
+ENDING: list[tuple[Lens, float, float]] = [  # lens, phi, the radius at which the derivative vanishes, in closed form
     (Radial((-1e-7,), (3,)), 800.0, np.sqrt(1.0 / 3e-7)),
     (Radial((-2e-4, -1e-7)), 800.0, (-4e-4 + np.sqrt(16e-8 + 12e-7)) / 6e-7),
     (Radial((0.0, 0.0, 3e-3, 4e-3), (2, 3), ("tangential",)), 800.0, 800.0 / 0.03),  # r - 3 |p| r^2
     (Brown((-0.2, 0.0, 0.0, 0.0, 0.0)), 800.0, 800.0 * np.sqrt(1.0 / 0.6) * (2.0 / 3.0)),
     (Brown((0.0, 0.0, 3e-3, 4e-3, 0.0)), 800.0, 800.0 / 0.06),  # r - 3 |p| r^2 in the worst direction
     (KannalaBrandt((-0.1, 0.0, 0.0, 0.0)), 300.0, 300.0 * np.sqrt(1.0 / 0.3) * (2.0 / 3.0)),
-    (KannalaBrandt((0.0, 0.0, 0.0, 0.0)), 300.0, 300.0 * np.pi),  # no farther than straight behind
+    (KannalaBrandt((0.0, 0.0, 0.0, 0.0)), 300.0, 300.0 * np.pi),  # not beyond the direction straight behind
 ]
 
 
@@ -177,7 +179,7 @@ def test_there_is_no_answer_beyond_it(lens: Lens, phi: float, radius: float) -> 
 
 @pytest.mark.parametrize("kind", ["brown", "kannala-brandt"])
 def test_decentred_lenses_have_an_answer_everywhere_inside(kind: str) -> None:
-    """In every direction, as near as one likes to where the map ends: one in forty had none."""
+    """In every direction, up to the limit of the map; one in forty had none."""
     rng = np.random.default_rng(0)
     for _ in range(300):
         across = rng.normal(0.0, 0.003, 2)
@@ -202,7 +204,7 @@ def test_the_radius_grows_up_to_there(drawn: tuple[Lens, float]) -> None:
     rays = lens.undistort(measured[:, None] * direction, phi)
     angle = np.arctan2(rays[:, :2] @ direction, rays[:, 2])
     assert np.all(np.diff(angle) > 0.0)
-    # The angle of the rays beyond has no pixel.
+    # Rays at larger angles have no pixel.
     over = angle[-1] + np.linspace(1e-3, 0.3, 50)
     over = over[over < np.pi]
     pixels = lens.distort(np.column_stack([np.sin(over)[:, None] * direction, np.cos(over)]), phi)
@@ -218,7 +220,7 @@ def test_a_lens_that_always_grows_has_no_end(values: tuple[float, ...], powers: 
 
 @pytest.mark.parametrize("tiny", [1e-18, -1e-18, 1e-30, -1e-300, 5e-324])
 def test_a_coefficient_of_next_to_nothing_moves_no_end(tiny: float) -> None:
-    # A root finder that divides by the leading coefficient loses the end at 500 px, or stumbles.
+    # A root finder that divides by the leading coefficient misses the end at 500 px, or fails.
     assert Radial((-1e-3, tiny)).monotone_radius(800.0) == pytest.approx(500.0, rel=1e-11)
     assert Brown((-0.2, 0.0, 0.0, 0.0, tiny)).monotone_radius(1.0) == pytest.approx(np.sqrt(20.0 / 27.0), rel=1e-12)
 
@@ -244,7 +246,7 @@ def test_nothing_is_seen_behind_the_camera(lens: Lens) -> None:
 
 
 def test_kannala_brandt_sees_behind_the_camera() -> None:
-    lens = KannalaBrandt()  # the angle itself times phi: all but straight behind
+    lens = KannalaBrandt()  # angle times phi: all directions but straight behind
     angle = np.radians([0.0, 60.0, 90.0, 120.0, 179.0])
     pixels = lens.distort(np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)]), 300.0)
     assert pixels[:, 0] == pytest.approx(300.0 * angle, rel=1e-15)  # measured 0
@@ -276,7 +278,7 @@ def opencv(project: Callable[..., Any], distortion: tuple[float, ...]) -> Array:
 def assert_same_rays(camera: pycolmap.Camera, rays: Array, pixels: Array) -> None:
     assert np.abs(np.asarray(camera.img_from_cam(rays)) - 0.5 - pixels).max() < 1e-9  # px; measured 4.6e-13
     theirs = np.asarray(camera.cam_from_img(pixels + 0.5))
-    assert np.abs(rays[:, :2] / rays[:, 2:] - theirs).max() * PHI < 1e-7  # px; their iteration ends there, at 2.8e-8
+    assert np.abs(rays[:, :2] / rays[:, 2:] - theirs).max() * PHI < 1e-7  # px; their iteration's tolerance is 2.8e-8
 
 
 @pytest.mark.parametrize("values", BROWN)

@@ -1,4 +1,4 @@
-"""The lens that the data ask for: what is chosen, over what, by how much, and where it is kept."""
+"""The lens choice: what is chosen among which lenses, by how much, and cases in which it is restricted."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _seen(lens: str, mix: str, seed: int = 1) -> Observations:
 
 
 def test_each_camera_of_a_rig_has_its_own_lens(tmp_path: Path) -> None:
-    """With one lens for both the fisheye was 12 stated radii off where nothing was observed, and right elsewhere."""
+    """With one lens for both, the fisheye had errors of 12 stated radii where nothing was observed."""
     cameras = {"left": scenes.camera("brown"), "right": scenes.camera("kannala-brandt")}
     right = Station("right", Pose.looking([0.3, 0.0, 0.0], np.eye(3)))
     stations = {"left": Station("left", Pose.identity()), "right": right}
@@ -98,7 +98,7 @@ def test_each_camera_of_a_rig_has_its_own_lens(tmp_path: Path) -> None:
 
 
 def test_a_lens_that_no_formula_has_in_one_view_of_a_floor() -> None:
-    """A moustache, which the longest formula leaves .8 of stated noise off, and 2 mm on the floor."""
+    """A moustache distortion: the longest formula has errors of 0.8 stated sigmas, and 2 mm on the floor."""
     camera = Camera((780, 580), 310.0, (391.0, 287.0), Moustache((0.2, 0.75)))
     station = Station("c", overhead_pose(0.1, -0.3, 4.8, 5.0, -3.0, 2.0))
     scene = field_scene(ssl_field("B"), {"c": camera}, {"s": station}, spacing_m=0.15)
@@ -112,7 +112,7 @@ def test_a_lens_that_no_formula_has_in_one_view_of_a_floor() -> None:
 
 @pytest.mark.parametrize("seed", [3, 12])  # 2.3, 1.9 times what was stated before, 8 to 22 % of places far beyond
 def test_a_lens_that_no_formula_has_is_stated_where_one_seems_to_fit(seed: int) -> None:
-    """Kannala-Brandt puts the camera elsewhere, and leaves nothing that goes together."""
+    """Kannala-Brandt's lens moves the camera, and leaves no correlated residuals."""
     rng = np.random.default_rng([7, seed])
     camera = Camera((780, 580), 310.0, (391.0, 287.0), Moustache((0.2, 0.75)))
     (x, y), height, (tilt_x, tilt_y, yaw) = rng.normal(0.0, 0.5, 2), rng.uniform(4.4, 5.4), rng.uniform(-8.0, 8.0, 3)
@@ -128,7 +128,7 @@ def test_a_lens_that_no_formula_has_is_stated_where_one_seems_to_fit(seed: int) 
 
 
 def test_what_one_power_more_would_leave_open_is_stated() -> None:
-    """Four powers are the longest that may be chosen, and no data say that there is no fifth."""
+    """Four powers are the most that may be chosen, and no data exclude a fifth."""
     lens = Radial((-3.5e-4, 4.5e-6, -1.024e-8, 8.5e-12), (2, 3, 4, 5))
     camera, place = Camera((960, 720), 443.0, (474.0, 367.0), lens), overhead_pose(0.2, -0.3, 4.66, 3.8, -3.0, 2.0)
     outer = [name for name in ssl_field("B").curves if "Circle" not in name and "Halfway" not in name]
@@ -150,7 +150,7 @@ def _straight_from_above() -> tuple[Camera, Observations]:
 
 
 def test_what_longer_lenses_leave_open_straight_from_above_is_stated() -> None:
-    """One coefficient predicts a floor as well as four, which the lens has, and would know phi three times as well."""
+    """One coefficient predicts a floor as well as the true lens's four, and would determine phi three times as well."""
     camera, observations = _straight_from_above()
     calibration = calibrate(observations)
     assert calibration.options.coefficients == ("k1", "p1", "p2")
@@ -161,7 +161,7 @@ def test_what_longer_lenses_leave_open_straight_from_above_is_stated() -> None:
 
 
 def _longer_straight_from_above() -> tuple[Comparison, Candidate]:
-    """What was compared, and a longer lens that predicts as well."""
+    """The comparison of lenses, and a longer lens that predicts as well."""
     _, observations = _straight_from_above()
     among = choose_lens(observations, Options(), initialise(gather_sights(observations), papers(Options()))).among
     assert among is not None
@@ -169,7 +169,7 @@ def _longer_straight_from_above() -> tuple[Comparison, Candidate]:
 
 
 def test_another_lens_leaves_phi_no_more_open_than_its_cost_allows() -> None:
-    """Normal equations may lead much farther along a bent valley: half of phi, where the cost rises by thousands."""
+    """Normal equations may extrapolate along a bent valley to half of phi, where the cost is thousands higher."""
     among, other = _longer_straight_from_above()
     near, phi = among.seen.solved_near(other).estimate, Key("camera", "c", "phi", "px")
     least = among.seen.solved_near(other, there=near, held=phi).cost
@@ -182,7 +182,7 @@ def test_another_lens_leaves_phi_no_more_open_than_its_cost_allows() -> None:
 
 
 def test_all_that_a_longer_lens_leaves_open_is_in_its_directions() -> None:
-    """At the floor and above it, where it was observed and in the picture's corners."""
+    """On the floor and above it, where it was observed and in the picture's corners."""
     among, other = _longer_straight_from_above()
     lenses = OtherLenses(among.there, (), (), among.chosen.of.reach_px)
     chosen, longer = (one.spread(Information.nothing(), one.of.slopes(lenses)) for one in (among.chosen, other))
@@ -218,7 +218,7 @@ def test_the_map_is_as_wrong_as_it_says_under_another_lens(lens: str) -> None:
 
 @pytest.mark.parametrize("coefficients", [(-0.18, 0.05, 2e-4, -3e-4, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
 def test_lenses_are_compared_by_exact_observations(coefficients: tuple[float, ...]) -> None:
-    """What a lens leaves of them is rounding, and so is what normal equations promise."""
+    """Residuals of the lenses are rounding errors, and so are the predictions of the normal equations."""
     true = Camera((1280, 960), 700.0, (643.0, 475.0), Brown(coefficients))
     world = {"camera": Station("camera", overhead_pose(0.2, -0.1, 5.2, 8.0, 3.0, yaw_deg=90.0))}
     scene = field_scene(ssl_field("B"), {"camera": true}, world, points=(), spacing_m=0.1)
@@ -235,7 +235,7 @@ def test_lenses_are_compared_by_exact_observations(coefficients: tuple[float, ..
 
 
 def test_few_errors_that_all_share_are_no_reason_for_a_longer_lens() -> None:
-    """Each group's gain is large, but only one of them has it: the difference is within its own scatter."""
+    """The mean gain is large, but only one group has it: the difference is within the groups' scatter."""
     plain = np.full(12, 10.0)
     better_once, better_everywhere = plain.copy(), plain - 2.0 + 0.1 * np.arange(12) % 2
     better_once[3] = 1.0
@@ -246,7 +246,7 @@ def test_few_errors_that_all_share_are_no_reason_for_a_longer_lens() -> None:
 
 
 def test_what_a_longer_lens_refutes_is_not_as_good() -> None:
-    """With few groups hardly any difference is outside of its own scatter, however large it is."""
+    """With few groups almost no difference is outside their scatter, however large it is."""
     plain, better_once = np.full(6, 10.0), np.array([1.0, *[10.0] * 5])
     labels, counts = [PAPER, "brown k1 k2 p1 p2"], [2, 4]
     assert decide(labels, counts, [plain, better_once], is_refuted=(True, False).__getitem__) == (1, 1)
@@ -255,7 +255,7 @@ def test_what_a_longer_lens_refutes_is_not_as_good() -> None:
 
 
 def test_corners_that_another_lens_explains_are_not_taken_out(tmp_path: Path) -> None:
-    """The longest radial lens predicts as well as the true one, and calls two corners of eleven outliers."""
+    """The longest radial lens predicts as well as the true one, and rejects two of eleven corners."""
     shot, path = disturbed.taken("sharp", 7, ssl_field("B")), tmp_path / "sharp.png"
     cv2.imwrite(str(path), shot.image)
     seen = detect_field([path], ssl_field("B"), disturbed.AUTO).observations
@@ -268,8 +268,8 @@ def test_corners_that_another_lens_explains_are_not_taken_out(tmp_path: Path) ->
 
 
 def test_a_quieter_lens_is_not_left_for_what_it_takes_out() -> None:
-    """Corners slightly off were "explained" by the noise of a lens that fits worse, and the right one was left for
-    `radial 2,3,4`: phi 826.7.
+    """Corners with small errors were explained by the noise of a lens that fits worse, and `radial 2,3,4` was chosen
+    instead of the right lens: phi 826.7.
     """
     camera, noise_px = replace(scenes.camera("brown"), lens=Brown((-0.3, 0.12, 0.001, -0.001, -0.02))), 0.02
     scene = board_scene(
@@ -287,7 +287,7 @@ def test_a_quieter_lens_is_not_left_for_what_it_takes_out() -> None:
 
 @pytest.mark.thorough
 def test_decentring_is_seen_in_a_few_views(sony_boards: BoardDetections) -> None:
-    """Halves of 13 views of 24 corners: .9 of what both state; with brown k1 in one of the second 2.2."""
+    """Halves of 13 views of 24 corners: 0.9 of what both state; with brown k1 for one of the second halves, 2.2."""
     for seed in (0, 5):
         calibration = calibrate(halves.halves(sony_boards.observations, seed)[0])
         (camera,) = calibration.cameras.values()
@@ -300,7 +300,7 @@ def test_decentring_is_seen_in_a_few_views(sony_boards: BoardDetections) -> None
 
 @pytest.mark.thorough
 def test_a_fisheye_in_few_views_has_a_start_of_its_own(real_data: Path) -> None:
-    """From the start with the paper's lens no kind comes near; the paper's was taken, which left 2.5 px."""
+    """From the estimate with the paper's lens no kind converged; the paper's was chosen, with 2.5 px residuals."""
     assert real_data.is_dir()
     half = halves.halves(halves.SETS["ov plane"].observations(), 7)[1]
     every_third = np.arange(len(half.points)) % 3 == 0
@@ -318,7 +318,7 @@ def test_where_the_longest_lenses_fold_shorter_ones_are_asked(monkeypatch: pytes
 
 
 def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where no lens can be compared, and where the best makes no calibration of all observations."""
+    """Where no lens can be compared, and where the best one gives no calibration of all observations."""
     seen, fold = _seen("kannala-brandt", "boards"), property(lambda _: "folds inside the image")
     with monkeypatch.context() as patched:
         patched.setattr(Candidate, "fault", fold)
@@ -357,11 +357,11 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
         assert choice.tried[0].worse == pytest.approx(worse, abs=0.3)
         gone.add(choice.chosen.split()[0])
     labels = [one.passed.form.label.split()[0] if one.passed else "" for one in outcomes]
-    assert labels == ["", "", "brown", "", "brown", "brown"]  # what each is compared with: the first that was passed
+    assert labels == ["", "", "brown", "", "brown", "brown"]  # each is compared with the first one passed
 
 
 def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After every other kind; what it says is said."""
+    """It is tried after every other kind, and its error is reported."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
     def broken(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
@@ -371,12 +371,12 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     monkeypatch.setattr(calibrating, "explained", broken)
     with pytest.raises(SolutionError, match=f"no camera with {PAPER}"):
         calibrate(seen)
-    assert asked[0] == asked[-1] == PAPER and len(asked) <= len(LENSES)  # once near, once from nothing
+    assert asked[0] == asked[-1] == PAPER and len(asked) <= len(LENSES)  # once near an estimate, once without one
 
 
 def test_groups_scatter_as_the_noise_has_it_or_more() -> None:
-    """Variances as groups scatter, over the noise's: 1 where errors are independent, 11 where a group of ten shares an
-    error as large as the noise.
+    """Ratio of the variance between groups to that of the noise: 1 for independent errors, 11 where the ten rows of a
+    group share an error as large as the noise.
     """
     for shared, expected in ((0.0, 1.0), (1.0, 11.0)):
         ratios = [_groups_of_ten(shared, seed).scatter_of(np.arange(4)) for seed in range(20)]
@@ -384,7 +384,7 @@ def test_groups_scatter_as_the_noise_has_it_or_more() -> None:
 
 
 def test_a_group_that_nearly_alone_tells_a_coefficient_scatters_no_more_than_the_noise() -> None:
-    """A field's far corner: by the jackknife its variance is 19 times the noise's, and no lens is refuted any more."""
+    """A field's far corner: by the jackknife its variance is 19 times the noise's, and no lens would be refuted."""
     ratios = [_groups_of_ten(0.0, seed, alone=100.0).scatter_of(np.arange(4)) for seed in range(40)]
     assert 0.75 < np.mean(ratios) < 1.2  # 0.87 measured
 
@@ -412,14 +412,16 @@ def test_probabilities_add_up_and_know_of_differences_alone(squares: Array, shif
 
 
 def test_probabilities_are_as_sure_as_groups_agree() -> None:
-    """One lens predicts worse by 8 in all: by all groups alike, or by one group for it and one against it."""
+    """One lens predicts worse by 8 in total: equally in all groups, or by one group for it and one against it."""
     alike = pseudo_bma([np.zeros(16), np.full(16, 0.5)])
     split = pseudo_bma([np.zeros(16), np.array([58.0, -50.0, *np.zeros(14)])])
     assert alike[1] < 0.05 < 0.3 < split[1]  # 0.022 and 0.375
 
 
 def test_what_other_lenses_would_say_is_stated(tmp_path: Path) -> None:
-    """Of one photograph three lenses predict alike, and the simplest is two standard deviations off by itself."""
+    """For one photograph three lenses predict equally well, and the simplest has an error of two
+    standard deviations.
+    """
     path = tmp_path / "cables.png"
     cv2.imwrite(str(path), disturbed.taken("cables", 14, ssl_field("B")).image)
     seen = detect_field([path], ssl_field("B"), disturbed.AUTO).observations
@@ -434,7 +436,7 @@ def test_what_other_lenses_would_say_is_stated(tmp_path: Path) -> None:
 
 
 def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ceres leaves a solve that failed where it started, which may be anywhere."""
+    """Ceres returns the initial values of a failed solve, which may be anywhere."""
     failing = itertools.count()
 
     def solved(*given: Any, **more: Any) -> Solution:
@@ -453,7 +455,7 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
 
 
 def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A solve that ran into another minimum is not the lens that predicts as well; the chosen one is there."""
+    """A solve that ends in another minimum does not give the lens that predicts as well."""
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
     start = initialise(gather_sights(observations), options)
     chosen = choose_lens(observations, Options(), start)
@@ -465,7 +467,7 @@ def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: 
 
 
 def test_a_lens_of_boards_near_its_best_is_where_a_solve_ends() -> None:
-    """Within a tenth of a standard deviation: so that no solve is needed."""
+    """Within a tenth of a standard deviation, so that no solve is needed."""
     observations = _seen("brown", "boards")
     among = choose_lens(observations, Options(), initialise(gather_sights(observations), papers(Options()))).among
     assert among is not None
@@ -516,13 +518,13 @@ def test_a_lens_that_no_formula_has_is_seen_in_what_all_others_leave() -> None:
     first, second, *_ = (one.rms_px for one in choice.tried)
     assert first and second and second > 1.6 * first  # 1.7 times
     seen = _seen("radial-2-3", "boards")
-    plain = calibrate(seen).lens_choice  # where nothing is left behind it is not looked at
+    plain = calibrate(seen).lens_choice  # without such residuals it is not tested
     assert plain is not None and not [one for one in plain.tried if one.label.startswith("spline")]
 
 
 @pytest.mark.thorough
 def test_more_observations_are_asked_where_all_leave_the_same_in_all_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By some of them rays were off by 5.6 times what was stated, of a full frame of 186 views."""
+    """With a part of them, rays had errors of 5.6 times the stated ones, for a full frame of 186 views."""
     monkeypatch.setattr(rough_lenses, "_VIEWS", 60)
     lens = rough_lenses.LENSES["waves along the radius"]
     seen = rough_lenses.observed(lens, 1)
@@ -532,7 +534,7 @@ def test_more_observations_are_asked_where_all_leave_the_same_in_all_views(monke
 
 
 def _normals(observations: Observations, calibration: Calibration) -> tuple[GroupNormals, Linearised]:
-    """Of each sight, with the linear model that they follow from."""
+    """Normals of each sight, and the linear model from which they are computed."""
     problem, estimate = calibration.problem(observations), calibration.estimate
     there = residuals(problem.sights, estimate)
     equations = write_equations(problem.sights, estimate, there)
@@ -542,7 +544,7 @@ def _normals(observations: Observations, calibration: Calibration) -> tuple[Grou
 
 
 def test_errors_without_a_placement_are_those_of_a_solve_without_it() -> None:
-    """To second order in what it moves: held against a solve in which the placement counts nothing."""
+    """To second order, compared with a solve in which the placement has no weight."""
     observations = _seen("radial-2-3", "boards")
     calibration = calibrate(observations, replace(_PLAIN, lens="radial"))
     out, estimate = observations.views[2].placement, calibration.estimate
@@ -562,7 +564,7 @@ def test_errors_without_a_placement_are_those_of_a_solve_without_it() -> None:
 
 
 def test_a_shorter_lens_is_the_longest_with_coefficients_at_0() -> None:
-    """Without a solve of its own its squares and its numbers are those of one."""
+    """Its squares and numbers, derived without a solve, equal those of a solve."""
     observations = _seen("radial-2-3", "boards")
     calibration = calibrate(observations, replace(_PLAIN, lens="radial", powers=(2, 3, 4, 5)))
     normals, _ = _normals(observations, calibration)
@@ -575,7 +577,7 @@ def test_a_shorter_lens_is_the_longest_with_coefficients_at_0() -> None:
     assert calibration.station().phi + there["phi"] == pytest.approx(shorter.station().phi, abs=0.1 * sd)
 
 
-# ---- where it is kept -----------------------------------------------------------------------------------------------
+# ---- where the choice is restricted ---------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("words_alone")
@@ -616,7 +618,7 @@ def test_options_name_the_lens_by_its_powers_alone() -> None:
 
 
 def test_few_observations_keep_to_the_papers_lens() -> None:
-    """Five points of a field tell lenses nothing, and it says so."""
+    """Five points of a field do not distinguish lenses, and the answer says so."""
     observations = _seen("radial-2-3", "corners")
     few = observations.part(np.arange(len(observations.points)) < 5, np.ones(0, bool))
     calibration = calibrate(few, Options(free_principal_point=False, fixed={"phi": 868.0, "aspect": 1.0}))
@@ -625,7 +627,7 @@ def test_few_observations_keep_to_the_papers_lens() -> None:
     assert any("no lens could be chosen" in words for words in calibration.warnings)
 
 
-_FEW = {  # corners of a division B field, clicked in pictures of wide lenses: size, phi, middle, k1 k2, turn, place
+_FEW = {  # clicked corners of a division B field through wide lenses: size, phi, centre, k1 k2, rotation, place
     "seven, and the height": (
         "TopCircleCrossing CenterMark BottomRightCorner LeftCircleCrossing LeftFieldRightPenaltyGoalCrossing "
         "RightPenaltyCenterCrossing BottomCircleCrossing",
@@ -641,7 +643,9 @@ _FEW = {  # corners of a division B field, clicked in pictures of wide lenses: s
 
 @pytest.mark.parametrize("few", _FEW)
 def test_too_few_corners_to_compare_lenses_by_count_other_kinds(few: str) -> None:
-    """With the paper's lens alone a middle was known to 3 px, 5.5 sd off, and places were 5 times their radius away."""
+    """With only the paper's lens a centre was known to 3 px with an error of 5.5 sd, and places had
+    errors of 5 radii.
+    """
     names, (size, phi, middle, ks, turn, place) = _FEW[few]
     field, at, rotation = ssl_field("B"), np.array(place), cv2.Rodrigues(np.array(turn))[0]
     seen = [field.point_index[name] for name in names.split()]
@@ -685,7 +689,7 @@ def test_a_few_corners_know_their_place_as_well_as_they_say() -> None:
 
 
 def test_a_few_corners_before_which_the_papers_lens_folds_have_another() -> None:
-    """They were refused: "the solved radial lens folds ..., choose fewer coefficients", which nobody had chosen."""
+    """They were refused with "the solved radial lens folds ..., choose fewer coefficients", which nobody had chosen."""
     field, pixels = ssl_field("A"), np.full((len(ssl_field("A").points), 2), np.nan)
     clicks = {
         "CenterMark": (324.59, 288.14), "TopCircleCrossing": (280.48, 310.06), "BottomCircleCrossing": (374.29, 262.87),
@@ -699,8 +703,8 @@ def test_a_few_corners_before_which_the_papers_lens_folds_have_another() -> None
 
 
 def test_two_cameras_by_a_few_corners_each() -> None:
-    """It ended in a KeyError: the lenses of one camera were asked beside the other camera, which its corners do not
-    show.
+    """It ended in a KeyError: the lenses of one camera were compared with the other camera included, which its corners
+    do not show.
     """
     lens = Brown((-0.19, 0.06, 0.0, 0.0, 0.0))
     cameras = {"left": Camera((1280, 960), 740.0, (646.5, 473.8), lens)}
@@ -719,7 +723,7 @@ def test_two_cameras_by_a_few_corners_each() -> None:
 
 
 def test_what_a_lens_does_not_solve_for_is_no_statement() -> None:
-    """A shorter lens that was chosen contradicts nothing that anybody said."""
+    """The choice of a shorter lens contradicts no statement."""
     calibration = calibrate(_seen("brown", "boards"), Options(lens="brown", coefficients=("k1",)))
     assert not calibration.conflicts
     assert calibration.station().lens.coefficients["k2"] == 0.0
@@ -737,7 +741,7 @@ def test_that_no_other_lens_could_be_compared_is_said(monkeypatch: pytest.Monkey
 
 
 def test_lenses_that_ended_in_a_wrong_valley_are_asked_again() -> None:
-    """A wide lens at a tilt of 10 degrees: all with a formula left 2.4 px, and a spline had a phi of 254 px."""
+    """A wide lens tilted by 10 degrees: all formulas had residuals of 2.4 px, and a spline had a phi of 254 px."""
     wide = Camera((1280, 960), 527.8, (645.2, 493.9), KannalaBrandt((-0.0173, 0.0004, -0.002, 0.0004)))
     station = Station("overhead", overhead_pose(3.6, 2.4, 3.04, 3.9, -9.6, yaw_deg=47.0))
     scene = field_scene(ssl_field("A"), {"overhead": wide}, {"overhead": station}, spacing_m=0.3)
@@ -749,8 +753,8 @@ def test_lenses_that_ended_in_a_wrong_valley_are_asked_again() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_lens_in_a_valley_is_compared_where_it_is_at_its_best(seed: int) -> None:
-    """Straight from above phi is open, and a solve falls by little at a step: k3 was left out, and maps were ten times
-    as far off as with it.
+    """From straight above phi is open, and the solve converges slowly: k3 was left out, and errors of maps were ten
+    times as large as with it.
     """
     pose = overhead_pose(-2.2, -0.15, 4.1, tilt_x_deg=4.0, tilt_y_deg=-3.0, yaw_deg=90.6)
     true = Camera((1280, 960), 872.0, (651.0, 469.0), Brown((-0.21, 0.055, 0.0012, -0.0009, -0.004)))

@@ -1,4 +1,4 @@
-"""A lens that nothing in the package names: defined here, and good for everything that a lens is for."""
+"""A lens that the package does not contain: defined here, it works wherever a lens is used."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ TRUE = Camera((1280, 960), 850.0, (646.5, 473.8), Division((-2.4e-7,)))
 
 @pytest.fixture(scope="module", autouse=True)
 def offered() -> Iterator[None]:
-    """The lens in the table, as long as these tests run."""
+    """The lens is in the table while these tests run."""
     register(Division)
     yield
     del LENSES["division"]
@@ -116,7 +116,7 @@ def test_a_name_is_given_once() -> None:
 
 
 def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:
-    """What the solve differentiates, against differences of the residuals."""
+    """The derivatives of the solve, compared with differences of the residuals."""
     from ceres_cal.problem.residuals import write_equations
 
     observations, options = simulation.observations, Options(lens="division", fixed={"k": -2.4e-7})
@@ -159,7 +159,7 @@ def test_it_is_diagnosed_and_reported(calibration: Calibration, simulation: Simu
 
 
 def test_what_it_lacks_is_said(simulation: Simulation) -> None:
-    """Held at no distortion, the radius shows in what is left over."""
+    """Fixed at no distortion, the residuals depend on the radius."""
     calibration = calibrate(simulation.observations, Options(lens="division", fixed={"k": -1.8e-7}))
     findings = diagnose(calibration, simulation.observations).findings
     radial = [finding for finding in findings if finding.kind == "radius"]

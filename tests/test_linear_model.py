@@ -1,4 +1,4 @@
-"""A refit is diagnosed as it was solved: under all that was known before."""
+"""A refit is diagnosed with the priors with which it was solved."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -68,7 +68,7 @@ def test_the_diagnosis_of_a_refit_gives_the_fit_s_own_noise(
     for noise in diagnosis.noise:
         assert noise.scale == pytest.approx(scales[noise.kind], rel=1e-9)
     assert diagnosis.degrees_of_freedom == pytest.approx(calibration.posterior.degrees_of_freedom, rel=1e-9)
-    # Counted again, observation by observation: what the fit took up of each.
+    # Recomputed, observation by observation: the part that the fit absorbed.
     assert redundancy(diagnosis) + USUAL_EQUATIONS == pytest.approx(diagnosis.degrees_of_freedom, rel=0.01)  # 0.003
     leverage = diagnosis.table.leverage[diagnosis.table.inlier]
     assert np.max(leverage) < 0.95

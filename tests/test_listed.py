@@ -1,4 +1,4 @@
-"""Points that are listed in another order than their target's are named before anything is solved for."""
+"""Points listed in another order than their target's are named before anything is solved for."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ Shown = dict[str, Array]
 
 
 def shown(target: Target, count: int = 12, right_m: float = 0.0, *, is_fisheye: bool = False) -> Shown:
-    """Pixels of a target by frame, as OpenCV projects it; of a camera that stands so far to the right."""
+    """Pixels of a target by frame, as OpenCV projects it, for a camera `right_m` to the right."""
     rng, places, frames = np.random.default_rng(4), target.point_array, Shown()
     near, far = (0.1, 0.25) if is_fisheye else (0.35, 0.5)
     while len(frames) < count:
@@ -62,7 +62,7 @@ def reordered(frames: Shown, order: Callable[[Array], Array], chosen: Callable[[
 
 
 def said_of(frames: Shown, target: Target = BOARD) -> str:
-    """What is said of the order, "" where nothing is."""
+    """The message about the order, "" where there is none."""
     try:
         require_as_listed(Observations.from_points(frames, target, SIZE))
     except InputError as error:
@@ -80,9 +80,9 @@ def said_of(frames: Shown, target: Target = BOARD) -> str:
     ],
 )
 def test_views_in_another_order_are_named(order: Callable[[Array], Array], words: str, is_fisheye: bool) -> None:
-    """All views listed by columns took 17 to 80 s to be refused, without the cause; of one view two thirds of its
-    points were taken out. Before fisheyes the right order leaves 0.2 to 0.4 of the distance between neighbours, the
-    wrong ones 1.5 and more (`_CLEARLY`).
+    """It took 17 to 80 s to refuse views listed by columns, without naming the cause; with one such view, two thirds of
+    its points were rejected. For fisheyes the right order leaves 0.2 to 0.4 of the distance between neighbours, wrong
+    ones 1.5 and more (`_CLEARLY`).
     """
     frames = shown(BOARD, is_fisheye=is_fisheye)
     assert said_of(frames) == ""
@@ -100,12 +100,12 @@ def test_columns_and_rows_exchanged_are_named_by_calibrate() -> None:
 
 @pytest.mark.parametrize("order", [lambda grid: grid[::-1], lambda grid: grid[:, ::-1], lambda grid: grid[::-1, ::-1]])
 def test_what_a_grid_looks_like_turned_or_mirrored_is_no_other_order(order: Callable[[Array], Array]) -> None:
-    """Mirrored views are named after the solve (`test_calibration`), turned ones matter to a rig alone."""
+    """Mirrored views are named after the solve (`test_calibration`); rotated ones matter only for a rig."""
     assert said_of(reordered(shown(BOARD), order, lambda number: number == 3)) == ""
 
 
 def test_lists_in_reverse_are_named_where_they_make_another_picture() -> None:
-    """Of Zhang's squares of four corners, one view of five: 129 of 1280 corners were taken out, without a name."""
+    """Zhang's squares of four corners in one view of five: 129 of 1280 corners were rejected without a name."""
     squares = [(x, y) for row in range(8) for x0 in range(8) for x, y in _square(x0, row)]
     target = custom({str(number): (x, y, 0.0) for number, (x, y) in enumerate(squares)}, movable=True)
     uneven = circle_grid(8, 5, 0.012, 0.008, asymmetric=True)

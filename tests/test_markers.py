@@ -65,7 +65,7 @@ def test_corners(picture: Image8, tmp_path: Path) -> None:
 
 
 def test_a_camera_over_the_floor(picture: Image8, tmp_path: Path) -> None:
-    """One picture of a tilted camera: everything follows, and the floor is not a board that somebody moves."""
+    """One picture of a tilted camera gives the calibration, and the floor is not treated as a movable board."""
     observations = detect_boards([write(tmp_path / "a.png", picture)], TARGET).observations
     assert observations.views[0].placement is None
     camera = calibrate(observations, Options(lens="brown", coefficients=("k1", "k2"))).estimate.camera_at("camera")

@@ -26,7 +26,7 @@ OPTIONS = Options(lens="brown")
 
 
 def small_boards(seed: int, count: int = 60) -> tuple[Scene, Observations]:
-    """Boards so small and far away that perspective hardly tells their two poses apart."""
+    """Boards so small and distant that perspective hardly distinguishes their two poses."""
     camera = Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(
@@ -64,7 +64,7 @@ def test_mirrored_poses_are_mended(seed: int) -> None:
     sights, weighting = gather_sights(observations), Weighting(0.3, 0.3, "trivial")
     problem = Problem(sights, make_layout(observations, OPTIONS), weighting=weighting, options=OPTIONS)
     mended, count, undecided = without_mirrored_poses(problem, wrong, frozenset(sights.keys))
-    assert count > 40  # 44 to 50 of 60: perspective leaves no doubt about the others, they are not tried
+    assert count > 40  # 44 to 50 of 60: perspective determines the others, which are not tried
     changed = [name for name, pose in mended.placements.items() if pose != wrong.placements[name]]
     assert len(changed) == count
     for name in changed:
@@ -83,7 +83,7 @@ def test_no_view_ends_mirrored_from_a_cold_start(seed: int) -> None:
 
 @pytest.mark.parametrize("how", ["as it is", "mirrored", "axes exchanged"])
 def test_boards_seen_from_behind_are_named(how: str) -> None:
-    """A picture that is mirrored fits as well; only which side of a printed board is seen tells it."""
+    """A mirrored picture fits as well; only the visible side of a printed board reveals it."""
     scene = board_scene(
         checkerboard(9, 6, 0.03),
         {"camera": Camera((1280, 960), 900.0, (645.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))},
@@ -103,7 +103,7 @@ def test_boards_seen_from_behind_are_named(how: str) -> None:
 
 
 def test_boards_whose_rows_are_counted_upwards_are_right_beside_a_floor() -> None:
-    """Cameras that see a floor from above have no mirrored pictures, whichever way the rows of boards are counted."""
+    """Cameras that see a floor from above have no mirrored pictures, whatever the order of a board's rows."""
     camera = Camera((1280, 960), 700.0, (645.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))
     stations = {"camera": Station("camera", overhead_pose(0.2, 0.1, 5.0, 8.0, 3.0, yaw_deg=20.0))}
     field = simulate(field_scene(ssl_field("B"), {"camera": camera}, stations), Disturbance(0.3, 0.3), 1).observations
@@ -117,7 +117,9 @@ def test_boards_whose_rows_are_counted_upwards_are_right_beside_a_floor() -> Non
 
 
 def test_views_from_the_other_side_of_a_board_are_named() -> None:
-    """Where one view lists its columns from the last to the first, its pose is mirrored and residuals tell nothing."""
+    """If one view lists its columns from the last to the first, its pose is mirrored, but its
+    residuals are not larger.
+    """
     board = checkerboard(7, 5, 0.0254)
     matrix, distortion = np.array([[810.0, 0.0, 362.0], [0.0, 807.0, 214.0], [0.0, 0.0, 1.0]]), np.zeros(5)
     rng, shown = np.random.default_rng(0), dict[str, np.ndarray]()

@@ -1,4 +1,4 @@
-"""Typical mistakes, in Python and on the command line: each ends in one line that names the thing and the remedy."""
+"""Typical mistakes, in Python and on the command line: each ends in one line that names the object and the remedy."""
 
 import json
 import shlex

@@ -1,4 +1,4 @@
-"""The noise scale describes the rows that are kept, also where the noise has tails; outliers do not widen it."""
+"""The noise scale describes the kept rows, also for noise with tails; outliers do not increase it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def calibrated(noise_px: Array) -> Calibration:
 
 @pytest.mark.parametrize("degrees", [np.inf, 5.0, 3.0, 2.0])
 def test_scale_is_that_of_the_rows_kept(degrees: float) -> None:
-    """Student's t: with two degrees of freedom 3 % of the rows are taken out, and the others were 6 % above it."""
+    """Student's t: with two degrees of freedom 3 % of the rows are rejected, and the scale was 6 % too large."""
     for seed in range(3):
         rng, shape = np.random.default_rng(seed), exact().points.pixels.shape
         noise = rng.standard_normal(shape) if np.isinf(degrees) else rng.standard_t(degrees, shape)
@@ -67,12 +67,12 @@ def test_scale_is_not_that_of_outliers() -> None:
 # ---- cameras of different noise -------------------------------------------------------------------------------------
 
 PLACES = ((-3.0, -2.25), (-3.0, 2.25), (3.0, -2.25), (3.0, 2.25))
-NOISY_PX = (0.1, 0.1, 0.1, 0.6)  # of each camera; sigmas of all are stated alike
+NOISY_PX = (0.1, 0.1, 0.1, 0.6)  # of each camera; the stated sigmas are equal
 
 
 @cache
 def four_cameras() -> Scene:
-    """The league's four cameras over a field, each tilted by ten degrees."""
+    """The league's four cameras above a field, each tilted by ten degrees."""
     tilts = ((10.0, 0.0), (-7.0, 7.0), (0.0, 10.0), (7.0, -7.0))
     cameras = {f"c{n}": Camera((1280, 960), 800.0, (639.5, 479.5), Radial((-5e-5, 6e-7))) for n in range(4)}
     poses = [overhead_pose(x, y, 4.0, *tilt, 0.0) for (x, y), tilt in zip(PLACES, tilts, strict=True)]
@@ -95,7 +95,7 @@ def calibrated_together(seed: int) -> Calibration:
 
 
 def floors(calibration: Calibration, name: str) -> tuple[float, float]:
-    """Root mean square error of a camera's floor over what is stated, and what is stated, mm."""
+    """Root mean square error of a camera's floor over the stated one, and the stated one, mm."""
     camera = four_cameras().camera_at(name)
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-4.5, 4.5, 19), np.linspace(-3.0, 3.0, 13)))
     places = np.column_stack([x, y, 0.0 * x])
@@ -108,8 +108,8 @@ def floors(calibration: Calibration, name: str) -> tuple[float, float]:
 
 @pytest.mark.thorough
 def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own_noise() -> None:
-    """At the mean noise of all the noisy one's floor was 2.9 times as far off as was stated, and in 60 % of places
-    beyond what holds 95 %; the others stated twice as much as they do now.
+    """With the mean noise of all cameras, the noisy one's floor had errors of 2.9 times the stated ones, and 60 % of
+    its places were outside their 95 % radius; the others stated twice as much as now.
     """
     runs = [calibrated_together(seed) for seed in range(2)]
     for name in ("c0", "c1", "c2", "c3"):
@@ -122,7 +122,7 @@ def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own
     (words,) = (text for text in runs[0].remarks if "noise differs by more" in text)
     assert "'c3'" in words
     levels = {level for level, text in judge_quality(quality_of(runs[0], noisy(0))).reasons if "noise differs" in text}
-    assert levels == {""}  # it is in the standard deviations
+    assert levels == {""}  # the standard deviations include it
 
 
 def test_cameras_of_alike_noise_have_one() -> None:
@@ -139,7 +139,7 @@ def test_a_camera_of_which_nothing_is_judged_has_no_noise_of_its_own() -> None:
 
 
 def clicked_beside_boards(seed: int) -> tuple[Observations, Camera]:
-    """A field clicked to 1 px beside boards detected to 0.1 px, both of sigma 1, and the camera that sees them."""
+    """A field clicked to 1 px and boards detected to 0.1 px, both with sigma 1, and the camera that sees them."""
     rng, field, board, size = np.random.default_rng(seed), ssl_field("B"), checkerboard(9, 6, 0.1), (1280, 960)
     camera = Camera(
         size, 800.0, (640.0, 480.0), Radial((-5e-5, 6e-7)), 1.0, overhead_pose(0.3, 0.2, 4.0, 8.0, -5.0, 20.0)
@@ -162,8 +162,8 @@ def clicked_beside_boards(seed: int) -> tuple[Observations, Camera]:
 
 
 def test_clicks_count_by_their_own_noise_beside_detected_boards() -> None:
-    """At the noise of the boards the pose went through four clicks, the others were outliers, and places were up to
-    6.1 times as far off as what holds 95 %.
+    """With the noise of the boards the pose passed through four clicks, the others were outliers, and errors were up to
+    6.1 times the 95 % radius.
     """
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 7), np.linspace(-1.0, 1.0, 5)))
     for seed in range(4):
@@ -195,7 +195,7 @@ def test_noise_of_cameras_comes_back_from_a_file_and_observations_take_it_once(t
 
 @pytest.mark.thorough
 def test_a_noisy_camera_that_stands_still_raises_no_alarm() -> None:
-    """New observations are judged at the noise that each camera had."""
+    """New observations are judged with the noise that each camera had."""
     verdicts = check(calibrated_together(0), noisy(20))
     assert all(verdicts[name].holds for name in ("c0", "c1", "c2", "c3"))
     moved = refit(calibrated_together(0), noisy(21))

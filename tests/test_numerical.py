@@ -1,4 +1,4 @@
-"""Odd but legal input ends in one line: numerical failure, exact data, files and options of another kind."""
+"""Odd but valid input ends in one line: numerical failure, exact data, files and options of another kind."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_what_numpy_warns_of_stays_off_the_screen() -> None:
 
 
 def test_exact_observations_agree_with_exact_statements() -> None:
-    """Residuals, and what a prior adds to their squares, are rounding alone."""
+    """Residuals, and the part of a prior in their squares, are rounding errors."""
     station = scenes.SCENES["radial-2-3/field-boards"]().stations["overhead"]
     height_m = float(station.cam_from_world.inverse.translation[2])
     for sigma in (1e-5, 0.01):
@@ -58,7 +58,7 @@ def test_exact_observations_agree_with_exact_statements() -> None:
 
 
 def test_a_plane_through_what_nearly_fits_exactly() -> None:
-    """Nine rows for eight numbers: the median distance is rounding, and must not decide who takes part."""
+    """Nine rows for eight numbers: the median distance is a rounding error, and must not decide which rows are used."""
     rng = np.random.default_rng(0)
     homography = np.array([[200.0, 30.0, 400.0], [10.0, 180.0, 300.0], [0.02, 0.05, 1.0]])
     places = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 2.0], [3.0, 2.0], [1.5, 1.0]])
@@ -90,7 +90,7 @@ def test_a_sigma_that_decides_alone_is_named(factor: float) -> None:
 
 @pytest.mark.parametrize("place_m", [1e6, 9e6])
 def test_targets_far_away_are_answered_or_refused(place_m: float) -> None:
-    """Points in coordinates of the earth, and boards that look as if they were there."""
+    """Points in geographic coordinates, and boards that appear to be there."""
     from ceres_cal.scene.targets import custom
 
     far = {name: (x + place_m, y, z) for name, (x, y, z) in NOISY.targets["field"].points.items()}

@@ -1,4 +1,4 @@
-"""Observations: exact round trips through both kinds of file, and one line for everything that can be wrong in one."""
+"""Observations: exact round trips through both kinds of file, and one line for every possible error in one."""
 
 import copy
 import io
@@ -68,7 +68,7 @@ def written(folder: Path, content: Document | bytes | str, name: str = "obs.json
 
 
 def assert_refused(path: Path, *parts: str) -> None:
-    """Loading gets one line that names the file, once and first, and all the parts."""
+    """Loading fails with one line that names the file once, at its beginning, and contains all parts."""
     with pytest.raises(InputError) as raised:
         Observations.load(path)
     text = str(raised.value)
@@ -99,7 +99,7 @@ TARGETS = {
 }
 finite = st.floats(allow_nan=False, allow_infinity=False)
 sigmas = st.floats(1e-12, 1e12)
-sigmas_px = st.floats(1e-3, 10.0)  # which differ by no more than measured pixels can
+sigmas_px = st.floats(1e-3, 10.0)  # with ratios that measured pixels may have
 
 
 @st.composite
@@ -166,7 +166,7 @@ def test_the_designs_file(tmp_path: Path) -> None:
     assert observations.stations == {"overhead": "overhead"} and observations.placements == ("0002",)
     assert observations.points.view.tolist() == [0, 1, 1]
     assert observations.points.pixels.tolist() == [[102.4, 800.1], [400.2, 300.1], [431.0, 300.9]]
-    assert observations.points.sigma_px.tolist() == [0.3, 1.0, 1.0]  # 1 where nobody stated one
+    assert observations.points.sigma_px.tolist() == [0.3, 1.0, 1.0]  # 1 where none is stated
     assert [observations.feature_name("point", row) for row in range(3)] == ["BottomLeftCorner", "0,0", "1,0"]
     assert [observations.feature_name("curve", row) for row in range(2)] == ["BottomTouchLine"] * 2
     assert observations.curves.side.tolist() == [0, 0]
@@ -221,7 +221,7 @@ def test_digest_tells_contents_apart(tmp_path: Path) -> None:
         change(changed)
         digests.add(Observations.load(written(tmp_path, changed)).digest)
     assert len(digests) == 1 + len(changes)
-    # The same columns mean another thing when a target lists its features in another order.
+    # The same columns have another meaning if a target lists its features in another order.
     orders = [{"a": [0, 0, 0], "b": [1, 0, 0]}, {"b": [1, 0, 0], "a": [0, 0, 0]}]
     for order in orders:
         changed = document()
@@ -235,7 +235,7 @@ def test_digest_tells_contents_apart(tmp_path: Path) -> None:
 def test_columns_are_owned_and_frozen() -> None:
     pixels = np.array([[1.0, 2.0]])
     points = Points(np.array([0], np.int64), [0], pixels, [1])  # type: ignore[arg-type]
-    pixels[0, 0] = 7.0  # the caller's array stays the caller's
+    pixels[0, 0] = 7.0  # the caller's array is not shared
     assert points.pixels.tolist() == [[1.0, 2.0]] and len(points) == 1
     assert [column.dtype for column in vars(points).values()] == [np.int32, np.int32, np.float64, np.float64]
     with pytest.raises(ValueError, match="read-only"):
@@ -305,7 +305,7 @@ TWO_CAMERAS = {"overhead": {"image_size": [1280, 960]}, "side": {"image_size": [
 
 
 def at(*place: str | int | slice, value: Any) -> Callable[[Document], object]:
-    """A change of the document: sets what is at a place in it."""
+    """A change of the document that sets the value at a place."""
 
     def change(data: Document) -> None:
         inner: Any = data
@@ -551,7 +551,7 @@ def test_npz_cut_short_anywhere(tmp_path: Path, arrays: dict[str, Any]) -> None:
 
 
 def message_of(path: Path) -> str | None:
-    """What InputError says on loading, if it is raised; no other error may be."""
+    """The message of the InputError on loading, if it is raised; no other error may be."""
     try:
         Observations.load(path)
     except InputError as error:
@@ -571,7 +571,7 @@ def test_npz_with_a_byte_changed(tmp_path: Path, arrays: dict[str, Any], compres
         if text := message_of(path):
             refused += 1
             assert text.startswith(f"{path}: ") and "\n" not in text
-    assert refused > 75  # what is left are fields of the archive that nobody reads, such as dates
+    assert refused > 75  # the others are unused fields of the archive, such as dates
 
 
 def test_other_files_under_its_name(tmp_path: Path) -> None:
@@ -611,7 +611,7 @@ def test_a_crash_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("what", ["camera", "station", "frame"])
 def test_a_name_that_no_file_can_hold(what: str) -> None:
-    """Bytes of a command line that are no UTF-8."""
+    """Bytes of a command line that are not UTF-8."""
     names = {"camera": "c", "station": "s", "frame": "f", what: "ove\udce9head"}
     view = View(names["frame"], names["camera"], names["station"], "field", None)
     seen = Points(np.zeros(1, np.int32), np.zeros(1, np.int32), np.full((1, 2), 9.0), np.ones(1))
@@ -624,7 +624,7 @@ def test_a_name_that_no_file_can_hold(what: str) -> None:
     "unit, origin_m, said",
     [
         (1.0, 0.0, ""),
-        (1.0, 9e4, ""),  # a surveyor's local grid: it was said to be in millimetres, and never trusted
+        (1.0, 9e4, ""),  # a surveyor's local grid: it was reported to be in millimetres, and not trusted
         (
             1.0,
             5.8e6,

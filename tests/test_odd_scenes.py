@@ -1,4 +1,4 @@
-"""Odd scenes that once gave a wrong answer in silence: `scripts/accuracy/odd_scenes.py` has the full samples."""
+"""Odd scenes that once gave a wrong answer without a warning: `scripts/accuracy/odd_scenes.py` has the full samples."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 from accuracy.odd_scenes import BESIDE, BY_DEFAULT, MOST_RADII, MOST_SIGMAS, ODD, outcome
 from thorough import partly
 
-# Sigmas of the farthest "known" number, radii of the farthest place: before, and measured since.
+# Largest error of a "known" number in sigmas, and of a place in radii: before, and measured now.
 _MENDED = {
     ("one board", "kannala-brandt", 16): "17780 sd: no lens on the way back from phi 70 px; refused",
     ("one board", "brown", 248): "7.3 sd: a second place of the valley along phi; none known",
@@ -34,13 +34,13 @@ def test_no_silent_wrong_answer(scene: tuple[str, str, int]) -> None:
 @pytest.mark.parametrize("seed", partly(range(2), [0]))
 @pytest.mark.parametrize("lens", ["radial", "brown", "kannala-brandt"])
 def test_few_points_beside_lines(lens: str, seed: int) -> None:
-    """A handful of points, which the fit nearly goes through, beside some 150 line points."""
+    """A few points, through which the fit nearly passes, and some 150 line points."""
     found = outcome("5 to 8 points beside lines", BESIDE["5 to 8 points beside lines"], lens, seed)
     assert not found.refused
     assert found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
 
 
 def test_a_wide_lens_above_a_field_by_default() -> None:
-    """The lens that predicts best by default has one coefficient and knew phi, 5.3 sd off; now 2.0."""
+    """The lens that predicts best by default has one coefficient; its phi had an error of 5.3 sd, now 2.0."""
     found = outcome("above a field", BY_DEFAULT["above a field"], "kannala-brandt", 64)
     assert found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII

@@ -1,4 +1,4 @@
-"""Scenes that OpenCV's functions show: `python scripts/run.py opencv_scenes` has the full samples."""
+"""Scenes projected by OpenCV's functions: `python scripts/run.py opencv_scenes` has the full samples."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _places() -> Array:
 
 @pytest.mark.parametrize("name", _LENSES)
 def test_opencv_shows_what_the_package_shows(name: str) -> None:
-    """Pixels, and which places are not shown, as behind a fold."""
+    """Pixels, and places that are not shown, for example beyond a fold."""
     camera, places = _seen_by(*_LENSES[name]), _places()
     pixels, own = camera.project(places), Camera(**vars(camera)).project(places)
     inside = in_image(pixels, camera.image_size)
@@ -57,7 +57,7 @@ def test_there_and_back(name: str) -> None:
 
 
 def test_a_tilted_sensor_is_no_camera_of_the_package() -> None:
-    """Its lens has more than the package's of that name."""
+    """Its lens has more numbers than the package's lens."""
     camera, places = _seen_by(850.0, TiltedSensor((*_BROWN, 0.02, -0.01))), _places()
     own = _seen_by(850.0, Brown(_BROWN)).project(places)
     inside = in_image(own, camera.image_size)
@@ -84,8 +84,8 @@ def test_a_stated_zoom() -> None:
 
 
 def test_a_refit_knows_no_more_of_phi_than_other_lenses_leave_open() -> None:
-    """Six clicks on a fisheye that was moved: phi was known to 30 px, and then to 5.6, 6.9 standard deviations off: the
-    other lenses' phi was cut off at what the chosen one alone had known.
+    """Six clicks for a fisheye that was moved: phi was known to 30 px, and then to 5.6 px with an error of 6.9 standard
+    deviations, since the phi of other lenses was limited to the range of the chosen one.
     """
     both = changed("moved", True, 200_234)
     old = both.calibrated(200_234)
@@ -111,7 +111,7 @@ def test_a_right_height_is_not_called_wrong(seed: int) -> None:
 
 
 def test_a_height_that_only_a_shorter_lens_contradicts_is_in_doubt() -> None:
-    """A lens with a coefficient less says 3.68 for 3.58 +- .01 m, and is as likely: both are in what is stated."""
+    """A lens with one coefficient less gives 3.68 instead of 3.58 +- 0.01 m, and is as likely: the sd includes both."""
     problem, calibration = stated_height("square pictures, height to 10 mm", 200_206)
     (words,) = (one for one in calibration.warnings if "may be wrong" in one)
     assert words.startswith("the stated height of station 'a', 3.58 ± 0.01 m: with the lens kannala-brandt k1 p1 p2 ")
@@ -121,7 +121,7 @@ def test_a_height_that_only_a_shorter_lens_contradicts_is_in_doubt() -> None:
 
 
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """A row for each figure, of the seeds that are asked for; 1 where one is missed."""
+    """A row for each figure of the given seeds; exit code 1 where one is missed."""
     case = "few clicks"
     assert opencv_scenes.main(["--runs", "1", "--first", "200001", "--case", case]) == 0
     printed = capsys.readouterr().out

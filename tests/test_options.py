@@ -1,4 +1,4 @@
-"""Options of commands: a parser made of a dataclass, and the dataclass filled."""
+"""Options of commands: a parser made from a dataclass, and the dataclass filled by it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -127,7 +127,7 @@ def test_every_argument_of_a_command_is_described_where_it_is_defined(name: str)
 
 
 def test_what_calibrate_hands_on_has_the_same_defaults_as_in_python() -> None:
-    """What has the name of an option of `Options` is handed on as it is; what is parsed further is not."""
+    """Fields with the name of an option of `Options` are passed on unchanged, except those that are parsed further."""
     shared: dict[str, Any] = {one.name: one.default for one in fields(CalibrateArguments)}
     parsed = {"lens", "powers", "terms", "as_built"}
     own = {one.name: one.default for one in fields(Options)}

@@ -1,4 +1,4 @@
-"""The table of outcomes: what it reads from commands, and which differences it marks."""
+"""The table of outcomes: figures read from commands, and the differences that it marks."""
 
 import json
 import sys
@@ -69,7 +69,7 @@ def test_a_table_is_stored_and_compared_with_its_own_kind(tmp_path: Path) -> Non
 
 
 def test_another_checkout_is_measured_with_its_own_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Wherever below scripts/ they lie; what gives no figures is said, and the exit code tells."""
+    """Anywhere below scripts/; a script without figures is reported, and changes the exit code."""
     (tmp_path / "scripts" / "accuracy").mkdir(parents=True)
     (tmp_path / ".venv").symlink_to(sys.prefix)
     script = tmp_path / "scripts" / "accuracy" / "odd_scenes.py"
@@ -81,7 +81,7 @@ def test_another_checkout_is_measured_with_its_own_scripts(tmp_path: Path, capsy
     assert main([*asked, "-o", str(stored)]) == 0
     assert main([*asked, "--against", str(stored)]) == 0
     script.write_text(f"print({ODD.replace('  1        0        2', '  1        0        3')!r})")
-    assert main([*asked, "--against", str(stored)]) == 1  # asked: 2 at most
+    assert main([*asked, "--against", str(stored)]) == 1  # limit: 2
     assert "missed now" in capsys.readouterr().out
     script.write_text("raise SystemExit(3)")
     assert main(asked) == 1

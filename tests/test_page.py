@@ -1,4 +1,4 @@
-"""The page: its state, its server, what is refused. A real Chromium drives it in test_page_in_chromium.py."""
+"""The page: its state, its server, and refusals. A real Chromium tests it in test_page_in_chromium.py."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def drag(name: str, x: float, y: float, **more: Any) -> Drag:
     return Drag(what=more.pop("what", "point"), name=name, x=x, y=y, sigma=3.0, last=more.pop("last", True), **more)
 
 
-# ---- the camera that follows the hand -------------------------------------------------------------------------------
+# ---- the camera that follows dragged points -------------------------------------------------------------------------
 
 
 def truth() -> Camera:
-    """A camera that looks at the field askew, half turned."""
+    """A tilted camera above the field, rotated by about 30 degrees."""
     straight = by_hand.guess(FIELD, (1280, 960), "right")
     return straight.at(Pose.exp((0.06, -0.04, 0.2, 0.1, 0.2, 0.5)) @ straight.cam_from_world)
 
@@ -90,7 +90,7 @@ def test_a_click_that_contradicts_the_others_is_named() -> None:
 
 
 def test_places_of_lines_take_part_in_a_start(tmp_path: Path) -> None:
-    """Corners 15 px off leave the halfway line 10 px off; two places of it mend that."""
+    """Corners with errors of 15 px leave the halfway line 10 px off; two places on it correct this."""
     camera, steps = truth(), np.array([[12.0, -9.0], [-9.0, 12.0], [9.0, 12.0], [-12.0, -9.0]])
     corners = camera.project(np.array([FIELD.points[name] for name in CORNERS])) + steps
     points = {name: tuple(pixel) for name, pixel in zip(CORNERS, corners.tolist(), strict=True)}
@@ -126,7 +126,7 @@ def test_undo_redo_and_what_is_kept(tmp_path: Path) -> None:
     assert session.state == State(target="ssl-b", points={"TopLeftCorner": Click(100.0, 90.0, 3.0)})
     session.step(back=False)
     assert load_state(tmp_path / KEPT) == session.state
-    assert session_of(tmp_path).state == session.state  # opened again: it goes on from there
+    assert session_of(tmp_path).state == session.state  # opened again, it continues from there
 
 
 def test_a_drag_is_no_change_until_it_is_let_go(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_regions_are_a_mask_and_steps_are_commands(tmp_path: Path) -> None:
 
 
 def test_what_clicks_alone_tell(tmp_path: Path) -> None:
-    """By six corners, 0.5 px good: phi and height are said, with how little they are known."""
+    """With six corners accurate to 0.5 px: phi and height are shown with their large uncertainties."""
     camera, draw = truth(), np.random.default_rng(3)
     names = [*CORNERS, "TopHalfwayCrossing", "LeftFieldLeftPenaltyCorner"]
     pixels = camera.project(np.array([FIELD.points[name] for name in names])) + draw.normal(0.0, 0.5, (6, 2))
@@ -193,7 +193,7 @@ def test_what_clicks_alone_tell(tmp_path: Path) -> None:
     assert [one["name"] for one in known["numbers"]] == ["phi of camera", "height of station"]
     assert known["level"] in ("care", "no") and "advice" not in known and len(known["maps"]) == 2
     session.drag(drag("TopLeftCorner", 100.0, 90.0))
-    assert session.everything()["known"] is None  # of other clicks
+    assert session.everything()["known"] is None  # it belonged to other clicks
 
 
 # ---- the server -----------------------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ Work = Callable[[aiohttp.ClientSession, str, Session], Awaitable[None]]
 
 
 def served(session: Session, work: Work) -> None:
-    """Serve the page in this process while something asks it."""
+    """Serve the page in this process while a client works."""
 
     async def whole() -> None:
         address: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -217,7 +217,7 @@ def served(session: Session, work: Work) -> None:
 
 
 def own(address: str) -> dict[str, str]:
-    """What a browser says of a page of this address."""
+    """Headers of a browser for a page with this address."""
     return {"Origin": address[: address.index("/", 8)]}
 
 
@@ -238,7 +238,7 @@ def test_the_page_its_scripts_and_photographs(tmp_path: Path) -> None:
 
 
 def test_strangers_are_refused(tmp_path: Path) -> None:
-    """A foreign Origin, a wrong token, another host's name, a path outside."""
+    """A foreign Origin, a wrong token, another host's name, and a path outside."""
 
     async def work(client: aiohttp.ClientSession, address: str, _: Session) -> None:
         root, token = address[: address.index("/", 8)], address.split("/")[3]
@@ -251,7 +251,7 @@ def test_strangers_are_refused(tmp_path: Path) -> None:
         assert await status(address) == 200
         assert await status(address, Origin="http://evil.example") == 403
         assert await status(address, Origin="null") == 403
-        assert await status(address, Host="evil.example:80") == 403  # a name that was bound to this machine
+        assert await status(address, Host="evil.example:80") == 403  # a foreign name that resolves to this machine
         assert await status(f"{root}/{token[:-1]}{'y' if token.endswith('x') else 'x'}/") == 403
         assert await status(f"{root}/") in (403, 404)
         for outside in ("..%2f..%2f..%2fetc%2fpasswd", "%2e%2e/server.py", "photograph/1", "photograph/-1", "state.py"):
@@ -260,7 +260,7 @@ def test_strangers_are_refused(tmp_path: Path) -> None:
             with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
                 await socket(client, address, **headers)
             assert refused.value.status == 403
-        with pytest.raises(aiohttp.WSServerHandshakeError):  # no browser, or none that says where it comes from
+        with pytest.raises(aiohttp.WSServerHandshakeError):  # without an Origin, so not from a browser
             await client.ws_connect(f"{address}socket")
 
     served(session_of(tmp_path), work)
@@ -282,7 +282,7 @@ def test_malformed_and_endless_messages(tmp_path: Path) -> None:
             await window.send_str('"' + "x" * 300_000)
             assert (await window.receive()).type in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED)
             assert window.close_code == 1009  # too big
-        async with socket(client, address) as window:  # and the next is served
+        async with socket(client, address) as window:  # the next one is served
             assert (await window.receive_json())["is"] == "state"
 
     served(session_of(tmp_path), work)
@@ -336,7 +336,7 @@ def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path, monkeypatch: py
 
 
 def test_done_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first file that finds no room is named; there is none of which half is written."""
+    """The first file without room is named; no file is incomplete."""
     points = {name: Click(100.0 + 10.0 * n, 90.0, 3.0) for n, name in enumerate(CORNERS)}
     session = session_of(tmp_path, State(target="ssl-b", points=points))
     session._now = replace(session._now, made=CommandResults((), {"field.json": b"{}"}, tmp_path / "calibration.json"))
@@ -370,7 +370,7 @@ def test_an_unforeseen_error_is_said_and_the_page_lives(tmp_path: Path, monkeypa
 
 
 def png_of(width: int, height: int) -> bytes:
-    """The head of a picture that says it is so large."""
+    """The header of a picture that claims to be so large."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))

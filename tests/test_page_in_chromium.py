@@ -1,4 +1,4 @@
-"""The page in a real Chromium: opened, dragged, found, written; skipped where there is none."""
+"""The page in a real Chromium: opened, dragged, detected, written; skipped where there is none."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def window() -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def photos3(real_data: Path) -> Path:
-    """The folder of rendered photographs that --auto is not tried on here, beside the real ones."""
+    """Folder of rendered photographs for which --auto is not tried here, beside the real ones."""
     folder = real_data.parent / "photos3"
     if not folder.is_dir():
         pytest.skip(f"no rendered photographs: {folder} is not there (it lies beside $CERES_CAL_REAL)")
@@ -46,7 +46,7 @@ def photos3(real_data: Path) -> Path:
 
 @contextmanager
 def opened(folder: Path, *arguments: str | Path) -> Iterator[str]:
-    """The address of the page that `ceres-cal open` serves; ended by Ctrl-C, after which it must have ended well."""
+    """The address of the page that `ceres-cal open` serves; it is ended by Ctrl-C, and must end with success."""
     command = [sys.executable, "-c", "from ceres_cal.cli import main; raise SystemExit(main())", "open"]
     words = [*map(str, arguments), "-o", str(folder), "--no-browser"]
     process = subprocess.Popen([*command, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -68,7 +68,7 @@ def shown(window: Browser, address: str, width: int = 1400) -> None:
 
 
 def screen(window: Browser, place: str) -> tuple[float, float]:
-    """Where in the window a place of the photograph is, as the page has it."""
+    """Position in the window of a place of the photograph, according to the page."""
     x, y = window.run(
         "(() => { const box = page.view.canvas.getBoundingClientRect(), "
         f"[x, y] = page.view.screen({place}); return [x + box.left, y + box.top]; }})()"
@@ -77,7 +77,7 @@ def screen(window: Browser, place: str) -> tuple[float, float]:
 
 
 def drag(window: Browser, start: str, end: tuple[float, float], steps: int = 5) -> None:
-    """With the mouse from a place (JavaScript) to a pixel of the photograph, until the page shows the answer."""
+    """Drag from a place (JavaScript) to a pixel of the photograph, and wait until the page shows the answer."""
     (x, y), (u, v) = screen(window, start), screen(window, json.dumps(end))
     before = window.run("page.now.revision")
     window.mouse("Moved", x, y)
@@ -94,7 +94,7 @@ def drag_corners(window: Browser, corners: Mapping[str, tuple[float, float]]) ->
 
 
 def press(window: Browser, button: str) -> None:
-    """A button, until the work is done."""
+    """Press a button, and wait until the work is done."""
     before = window.run("page.now.revision")
     window.run(f"document.getElementById('{button}').click()")
     window.wait_for(f"!page.now.busy && page.now.revision > {before} || page.now.message")
@@ -102,13 +102,13 @@ def press(window: Browser, button: str) -> None:
 
 
 def keep(window: Browser, name: str) -> None:
-    """A screenshot for people, where CERES_CAL_PICTURES names a folder for them."""
+    """A screenshot, if CERES_CAL_PICTURES names a folder for it."""
     if folder := os.environ.get("CERES_CAL_PICTURES"):
         window.screenshot(Path(folder) / f"{name}.png")
 
 
 def test_the_sample_found_by_itself(window: Browser, tmp_path: Path) -> None:
-    """The way round is said by a click on the goal; two boards take part."""
+    """A click on the goal resolves the symmetry; two boards are used."""
     folder = PHOTOGRAPH.parent
     photographs = (PHOTOGRAPH, folder / "board_01.jpg", folder / "board_05.jpg")
     with opened(tmp_path / "page", *photographs, "--target", "ssl-b", "--board", "9x6x100mm") as address:
@@ -130,7 +130,7 @@ def test_the_sample_found_by_itself(window: Browser, tmp_path: Path) -> None:
         window.wait_for("page.view.picture && page.view.layers[0].lines.length == 15")  # of the board
         keep(window, "6-board")
         window.run("page.change({exports: ['opencv']})")
-        window.wait_for("page.now.state.exports.length && page.now.found")  # what was found stays
+        window.wait_for("page.now.state.exports.length && page.now.found")  # the detections stay
         press(window, "done")
         assert (tmp_path / "page/opencv.yml").exists()
     assert window.complaints == []
@@ -152,7 +152,7 @@ def test_the_sample_found_by_itself(window: Browser, tmp_path: Path) -> None:
 def test_four_corners_of_a_photograph_that_is_not_found_by_itself(
     window: Browser, photos3: Path, tmp_path: Path
 ) -> None:
-    """Lines of another sport lie on this field; the corners are dragged 8 px beside where they are."""
+    """This field has lines of another sport; the corners are dragged to places with errors of 8 px."""
     photograph = photos3 / "extra0.jpg"
     truth = json.loads((photos3 / "extra0.truth.json").read_text())
     true, height = truth["corners_px"], f"height_m={truth['camera_position_m'][2]:.3f}:100mm"
@@ -163,7 +163,7 @@ def test_four_corners_of_a_photograph_that_is_not_found_by_itself(
         keep(window, "1-opened")
         drag_corners(window, corners)
         keep(window, "2-dragged")
-        window.run(f"page.change({{priors: ['{height}']}})")  # a height that is open takes every map long
+        window.run(f"page.change({{priors: ['{height}']}})")  # with an open height every map takes long
         window.wait_for("page.now.state.priors.length")
         press(window, "find")
         keep(window, "3-found")
@@ -196,7 +196,7 @@ def test_four_corners_of_a_photograph_that_is_not_found_by_itself(
 
 
 def test_a_real_photograph(window: Browser, real_data: Path, tmp_path: Path) -> None:
-    """A frame of another league's overhead camera: the model that corners alone tell lies about on its lines."""
+    """A frame of another league's overhead camera: the model from corners alone agrees approximately with its lines."""
     corners = {
         "TopLeftGoalAreaCorner": (152.0, 169.0),
         "BottomLeftGoalAreaCorner": (145.0, 531.0),
@@ -213,7 +213,7 @@ def test_a_real_photograph(window: Browser, real_data: Path, tmp_path: Path) -> 
 
 
 def test_a_killed_browser_and_the_keyboard(window: Browser, tmp_path: Path) -> None:
-    """Chromium is killed in the middle of a drag; the next one goes on with the keys alone."""
+    """Chromium is killed during a drag; the next one continues with the keyboard only."""
     with opened(tmp_path / "page", PHOTOGRAPH, "--target", "ssl-b") as address:
         with browser() as other:
             shown(other, address)
@@ -225,7 +225,7 @@ def test_a_killed_browser_and_the_keyboard(window: Browser, tmp_path: Path) -> N
             other.kill()
         shown(window, address, 800)
         keep(window, "8-narrow")
-        assert window.run("Object.keys(page.now.state.points)") == ["TopLeftCorner"]  # what was let go
+        assert window.run("Object.keys(page.now.state.points)") == ["TopLeftCorner"]  # the point that was released
 
         window.run("document.getElementById('view').focus()")
         for key in ("n", "n"):  # the second corner
@@ -252,7 +252,7 @@ def test_a_killed_browser_and_the_keyboard(window: Browser, tmp_path: Path) -> N
 
 
 def test_parts_are_said_on_the_right(window: Browser, tmp_path: Path) -> None:
-    """Lines that are not painted, a region, a dimension, a line dragged, a height; two windows show the same."""
+    """Lines that are not painted, a region, a dimension, a dragged line, a height; two windows show the same."""
     with opened(tmp_path / "page", PHOTOGRAPH, "--target", "ssl-b") as address:
         shown(window, address)
         window.run("document.querySelector('#painted input').click()")
@@ -291,7 +291,7 @@ def test_parts_are_said_on_the_right(window: Browser, tmp_path: Path) -> None:
         window.mouse("Released", x, y, button="left", clickCount=1)
         window.wait_for("'CenterMark' in page.now.state.points")
         x, y = screen(window, "page.now.model.points.RightPenaltyMark")
-        for _ in range(2):  # chosen, and said to be right
+        for _ in range(2):  # chosen, and confirmed
             window.mouse("Pressed", x, y, button="left", buttons=1, clickCount=1)
             window.mouse("Released", x, y, button="left", clickCount=1)
         window.wait_for("'RightPenaltyMark' in page.now.state.points")
@@ -300,7 +300,7 @@ def test_parts_are_said_on_the_right(window: Browser, tmp_path: Path) -> None:
             window.run("document.getElementById('undo').click()")
             window.wait_for(f"page.now.revision > {before}")
         assert window.run("page.now.undo") == 0 and window.run("page.now.state.regions") == []
-        window.run("document.getElementById('end').click()")  # the page ends when it is told so
+        window.run("document.getElementById('end').click()")  # the page ends on request
         window.wait_for("document.body.classList.contains('ended')")
         assert window.complaints == []
 

@@ -1,4 +1,4 @@
-"""Fields and courts from data files: shapes against the rules' figures, symmetry, and what may be changed."""
+"""Fields and courts from data files: shapes compared with the rules, symmetry, and dimensions that may be changed."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ from ceres_cal.simulate import Disturbance, Station, simulate
 EVERY = {**targets_by_name(), "tape-grid": tape_grid(5, 4, 0.5, 0.02)}
 each = pytest.mark.parametrize("name", EVERY)
 FREE_ENDS = ("Mark", "CenterLine", "NoCharge", "Cut", "Halfway")
-"""What ends where no line is: marks, overhanging lines, and what ends at walls that are no lines."""
+"""Curves that end without a line: marks, overhanging lines, and lines that end at unpainted walls."""
 
 
 @each
@@ -40,7 +40,7 @@ def test_it_is_closed_under_its_symmetry(name: str) -> None:
     for image in ((-1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, -1.0, 1.0)):
         points, curves, _ = counterparts(target, np.array(image))
         assert np.all(points >= 0) and np.all(curves >= 0)
-    assert len(turns_of(target, target.curve_names)) == 2  # it looks alike turned by half a turn: --facing says which
+    assert len(turns_of(target, target.curve_names)) == 2  # symmetric under rotation by 180 degrees: see --facing
 
 
 @each
@@ -73,7 +73,7 @@ def test_sources_and_measures_are_named() -> None:
 
 @pytest.mark.parametrize(
     "kind, variant, curve, side, from_the_rules",
-    [  # an edge or a middle, and where the rules put it: |x| or |y| of it
+    [  # an edge or a middle, and its |x| or |y| according to the rules
         ("football-field", None, "LeftGoalLine", 1, {"x": 52.5}),
         ("football-field", None, "LeftPenaltyArea", -1, {"x": 36.0}),
         ("football-field", None, "TopLeftPenaltyAreaSide", 1, {"y": 20.16}),
@@ -128,7 +128,7 @@ def test_parts_are_switched_and_dimensions_replaced() -> None:
 
 @given(st.sampled_from(sorted(templates())), st.data())
 def test_a_dimension_moves_features_in_proportion(kind: str, data: st.DataObject) -> None:
-    """What `dimension_slopes` rests on: any dimension may be a little larger, and features keep their names."""
+    """The basis of `dimension_slopes`: any dimension may be slightly larger, and features keep their names."""
     target = next(target for target in EVERY.values() if target.kind == kind)
     name = data.draw(st.sampled_from(sorted(target.dimensions)))
     other = target_from_spec({**target.spec, name: 1.001 * target.dimensions[name]}, "here")
@@ -183,7 +183,7 @@ def test_it_is_drawn_and_spelled_out(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_a_photograph_of_another_league(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without a start; and where nothing says which way round it is, what was seen is drawn."""
+    """Without an initial camera; where the symmetry is not resolved, the detected lines are drawn."""
     shot = take_field("vss-3", EVERY["vss-3"], 2)
     path, refused, out = (str(tmp_path / name) for name in ("vss.png", "refused.png", "o.json"))
     cv2.imwrite(path, shot.picture.image)
@@ -221,7 +221,7 @@ def test_a_real_photograph_that_was_stretched(
 
 
 def test_a_court_that_is_a_millimetre_off_is_no_stretched_picture() -> None:
-    """Seen from a stand: with square pixels some lens suits its lines, to 0.06 px, as well as with any others."""
+    """Seen from a stand: with square pixels some lens fits its lines to 0.06 px, as well as with other pixels."""
     lens, pose = Brown((-0.2, 0.06, 2e-4, -3e-4, 0.0)), overhead_pose(0.5, -22.0, 12.0, -60.0)
     seen = Camera((960, 540), 790.0, (483.0, 266.0), lens, 1.0, pose)
     painted = painted_field("tennis-court", court_length_m=23.77, doubles_width_m=10.97, singles_width_m=8.23)

@@ -1,4 +1,4 @@
-"""What the paper gets wrong, and what it gets right (docs/mathematics.md): its lens, its matrices, its sign."""
+"""Errors of the paper, and what is right in it (docs/mathematics.md): its lens, its matrices, its sign."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ quick = settings(deadline=None, max_examples=40)
 
 @st.composite
 def overhead_cameras(draw: st.DrawFn) -> Camera:
-    """A camera above the field that looks down, up to 30 degrees askew and turned anyhow."""
+    """A camera above the field that looks down, tilted by up to 30 degrees, with any yaw."""
     alpha, beta = (draw(st.floats(-0.5, 0.5)) for _ in range(2))
     position = draw(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(1.0, 6.0)))
     rotation = rotation_from_euler(np.pi + alpha, beta, draw(st.floats(-np.pi, np.pi)))
@@ -38,7 +38,8 @@ PIXELS = np.stack(np.meshgrid(np.linspace(-0.5, 779.5, 9), np.linspace(-0.5, 579
 
 
 def test_the_printed_polynomial_is_that_of_the_radius() -> None:
-    # d_r = a1 r + a2 r^2 + a3 r^3 is printed as the factor. As one it would be 0 at the centre and 655.7 at 450 px.
+    # d_r = a1 r + a2 r^2 + a3 r^3 is printed as the factor. As a factor it would be 0 at the centre and 655.7 at
+    # 450 px.
     as_printed = np.polyval([A3, A2, A1, 0.0], 450.0)
     assert as_printed == pytest.approx(655.7, abs=0.05)
     lens, _ = Radial.from_paper(A1, A2, A3, 800.0)
@@ -56,7 +57,7 @@ def test_the_true_factor_is_1_at_the_centre() -> None:
 def test_the_papers_lens_never_folds() -> None:
     lens, phi = Radial.from_paper(A1, A2, A3, 800.0)
     assert lens.monotone_radius(phi) == np.inf
-    lens, phi = Radial.from_paper(A1, 4.0 * A2, A3, 800.0)  # a lens that does
+    lens, phi = Radial.from_paper(A1, 4.0 * A2, A3, 800.0)  # a lens that folds
     slope_vanishes = np.roots([3.0 * A3, 2.0 * 4.0 * A2, A1])
     assert lens.monotone_radius(phi) == pytest.approx(slope_vanishes.real.min(), rel=1e-13)  # px; measured 2e-16
 
@@ -81,7 +82,7 @@ def test_a_common_factor_of_a1_a2_a3_and_phi_changes_nothing(camera: Camera, fac
 @given(overhead_cameras(), st.sampled_from([0.0, 0.15]))
 def test_homography_project_and_locate_agree(camera: Camera, height_m: float) -> None:
     xy = camera.locate(PIXELS, height_m)
-    xy = xy[np.max(np.abs(xy), axis=1) < 20.0]  # m; a tilted camera sees on to the horizon, and above it
+    xy = xy[np.max(np.abs(xy), axis=1) < 20.0]  # m; a tilted camera sees the horizon, and above it
     assert len(xy) > 0
     pixels = camera.project(np.column_stack([xy, np.full(len(xy), height_m)]))
     image = undistorted(camera, pixels)

@@ -1,4 +1,4 @@
-"""Options, and the layout of the solver's numbers: what is free, shared, held or anchored."""
+"""Options, and the layout of the solver's numbers: free, shared, fixed or anchored."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from ceres_cal.scene.targets import checkerboard
 BOARD = checkerboard(3, 2, 0.1)
 
 ALONE: dict[str, Any] = {"usual_camera": False}
-"""Nothing is taken for usual of cameras."""
+"""No priors on usual cameras."""
 
 each_lens = pytest.mark.parametrize("lens", scenes.LENSES)
 
 
 def watched(*views: tuple[str, str | None], cameras: dict[str, str] | None = None) -> Observations:
-    """One point in each view of (station, placement); every station has a camera of its own name unless told."""
+    """One point in each view of (station, placement); by default every station has a camera with its own name."""
     owner = cameras or {}
     entries = tuple(
         View(str(number), owner.get(station, station), station, "board", placement)
@@ -118,7 +118,7 @@ def test_vector_and_camera_are_one(lens: str) -> None:
 
 @each_lens
 def test_scaled_coefficients_are_of_order_one(lens: str) -> None:
-    """The paper's coefficients in px are 1e-4 to 1e-13; the solver's are not."""
+    """The paper's coefficients in px are 1e-4 to 1e-13; the solver's are scaled."""
     assert 1e-4 < np.max(np.abs(intrinsics_vector(scenes.camera(lens))[4:])) < 10.0
 
 
@@ -129,7 +129,7 @@ def test_unit_is_half_the_diagonal(width: int, height: int) -> None:
 
 
 def test_radial_coefficients_scale_with_their_power() -> None:
-    """a_k r^k over r, at r = half the diagonal: what the lens does at the corner."""
+    """a_k r^k over r at r = half the diagonal: the effect of the lens in the corner."""
     camera = Camera((600, 800), 700.0, (300.0, 400.0), Radial((1e-4, 2e-7), (2, 3)))
     assert intrinsics_vector(camera)[4:-1] == pytest.approx([1e-4 * 500.0, 2e-7 * 500.0**2], rel=1e-15)
 
@@ -166,7 +166,7 @@ def test_free_numbers(options: Options, free: list[str]) -> None:
 
 
 def test_layout_counts_every_pose_once() -> None:
-    """A camera of two stations, a board at two placements, one of them seen twice."""
+    """A camera with two stations, a board at two placements, one of which is seen twice."""
     seen = watched(("a1", None), ("a2", None), ("a1", "p"), ("a2", "p"), ("a1", "q"), cameras={"a1": "a", "a2": "a"})
     layout = make_layout(seen, RADIAL)
     assert layout == Layout(layout.free, frozenset({"a1", "a2"}), frozenset({"p", "q"}))
@@ -179,9 +179,9 @@ def test_layout_counts_every_pose_once() -> None:
         ([("a", None)], set()),
         ([("a", "p")], {"a"}),
         ([("a", "p"), ("a", "q")], {"a"}),
-        ([("a", "p"), ("b", "p")], {"a"}),  # one freedom for the two of them
-        ([("a", "p"), ("b", "q")], {"a", "b"}),  # two worlds that nothing ties
-        ([("a", "p"), ("b", "q"), ("c", "p"), ("c", "q")], {"a"}),  # ... but for a third
+        ([("a", "p"), ("b", "p")], {"a"}),  # one gauge freedom for both
+        ([("a", "p"), ("b", "q")], {"a", "b"}),  # two separate worlds
+        ([("a", "p"), ("b", "q"), ("c", "p"), ("c", "q")], {"a"}),  # ... tied by a third station
         ([("a", "p"), ("b", "p"), ("b", None)], set()),
         ([("a", "p"), ("b", "p"), ("b", "q"), ("c", "q"), ("c", None)], set()),
         ([("a", None), ("b", "p")], {"b"}),
@@ -197,7 +197,7 @@ def test_one_station_of_each_group_that_nothing_ties_to_the_world(
 
 
 def test_views_without_observations_count_for_nothing() -> None:
-    """A field that was looked for and not found ties nothing to the world; a placement nobody saw is no unknown."""
+    """A field that was not found ties nothing to the world; a placement that is not seen is no unknown."""
     seen = watched(("a", "p"))
     empty = (View("7", "a", "a", "board"), View("8", "a", "a", "board", "q"), View("9", "a", "a2", "board", "p"))
     layout = make_layout(replace(seen, views=(*seen.views, *empty)), RADIAL)
@@ -231,7 +231,7 @@ def test_poses_chain_from_frame_to_camera() -> None:
         ({"tolerances": {"field": 0.01}}, r"Options\(tolerances=\.\.\.\): Expected names with values"),
         ({"free_skew": 1}, r"Options\(free_skew=\.\.\.\): Expected true or false"),
         ({"reject_sigma": 1e300}, "reject_sigma must be 0.001 to 1e\\+09 sigmas, not 1e\\+300"),
-        ({"reject_sigma": 1e10}, "reject_sigma must be 0.001 to"),  # which no file of JSON holds
+        ({"reject_sigma": 1e10}, "reject_sigma must be 0.001 to"),  # infinity, which JSON does not have
         ({"loss_scale": 1e-300}, "loss_scale must be 0.001 to 1e\\+09 sigmas, not 1e-300"),
         ({"threads": 10**30}, "threads must be 2147483647 at most, not 1e\\+30"),
         ({"max_iterations": 2**31}, "max_iterations must be 2147483647 at most"),

@@ -1,8 +1,9 @@
 """The same optimum as independent solvers on the same corners: OpenCV, and pycolmap's own C++ cost functions; and the
-script that asks all peers, by what is installed here.
+script that compares all installed peers.
 
-The corners are noisy, so the optimum is not the truth and residuals do not vanish: agreement means the same model, the
-same cost and a solver that has come to rest. pyceres and pycolmap are pinned as a pair; this is the test of that pair.
+The corners are noisy, so that the optimum differs from the truth and residuals do not vanish: agreement means the same
+model, the same cost and a converged solver. The versions of pyceres and pycolmap are pinned as a pair, which is tested
+here.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Station, simulate
 
-BOARD = checkerboard(9, 6, 0.125)  # its corners are the same numbers in single precision, which OpenCV asks for
+BOARD = checkerboard(9, 6, 0.125)  # its corners are exact in single precision, which OpenCV needs
 SIZE = (1280, 960)
 LENSES: dict[str, tuple[float, Lens]] = {
     "brown": (825.0, Brown((-0.24, 0.082, 4e-4, -3e-4, -0.011))),
@@ -47,7 +48,7 @@ LENSES: dict[str, tuple[float, Lens]] = {
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a solver found: phi, aspect, cx, cy and coefficients; cam_from_board of every view; 2D rms."""
+    """Result of a solver: phi, aspect, cx, cy and coefficients; cam_from_board of every view; 2D rms."""
 
     intrinsics: Array
     poses: Sequence[Pose]
@@ -72,7 +73,7 @@ def corners(lens: str) -> Observations:
 
 
 def per_view(observations: Observations, precision: Any) -> tuple[list[Any], list[Any]]:
-    """Board points and pixels of each view, as OpenCV takes them."""
+    """Board points and pixels of each view in OpenCV's form."""
     rows = [np.flatnonzero(observations.points.view == number) for number in range(len(observations.views))]
     (board,) = observations.targets.values()
     places = [board.point_array[observations.points.feature[row]].astype(precision) for row in rows]
@@ -95,7 +96,7 @@ def ours(lens: str, free_aspect: bool = True, fixed: tuple[str, ...] = ()) -> tu
 
 
 def assert_same(found: Answer, peer: Answer, fixed: int = 0) -> None:
-    """Every parameter equal to 1e-6, relative; the principal point relative to phi, rotations in rad."""
+    """Every parameter is equal to 1e-6, relative; the principal point relative to phi, rotations in rad."""
     free = len(found.intrinsics) - fixed
     size = np.abs(peer.intrinsics[:free])
     size[2:4] = peer.intrinsics[0]
@@ -130,7 +131,7 @@ def test_opencv_brown(free_aspect: bool) -> None:
 
 
 def test_opencv_fisheye() -> None:
-    """Started 1 % from our answer: from nothing it ends at an rms of 377 px."""
+    """Started with errors of 1 %: without an initial estimate it ends with an rms of 377 px."""
     _, found = ours("kannala-brandt")
     phi, aspect, cx, cy, *coefficients = found.intrinsics * 1.01
     start = np.array([[phi, 0.0, cx], [0.0, phi * aspect, cy], [0.0, 0.0, 1.0]])
@@ -142,7 +143,7 @@ def test_opencv_fisheye() -> None:
 
 # ---- pycolmap's cost functions in a pyceres problem -----------------------------------------------------------------
 
-HALF = 0.5  # COLMAP's pixels count from the corner of the top-left one
+HALF = 0.5  # in COLMAP the centre of the top-left pixel is (0.5, 0.5)
 
 
 def solve_with_colmap(
@@ -150,9 +151,9 @@ def solve_with_colmap(
 ) -> tuple[Array, list[Pose], float]:
     """Least squares over COLMAP's parameters and one pose per view.
 
-    A pose is a quaternion and a translation in one block, for which pyceres has no manifold. So each round turns the
-    board's points by the rotation found so far and solves for a small one (x, y, z, 1), w held: where x, y, z end at 0
-    that is a stationary point over the rotations.
+    A pose is a quaternion and a translation in one block, for which pyceres has no manifold. Therefore each round
+    rotates the board's points by the present rotation and solves for a small one (x, y, z, 1) with w fixed. Where x, y,
+    z end at 0, the rotation is stationary.
     """
     parameters, poses = start.copy(), list(poses)
     options, summary = pyceres.SolverOptions(), pyceres.SolverSummary()
@@ -209,7 +210,7 @@ def test_pycolmap_cost_functions(name: str) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_pycolmap_projects_as_we_do(name: str) -> None:
-    """One of its cost functions evaluated by hand."""
+    """One of its cost functions evaluated directly."""
     lens, _, without, more = MODELS[name]
     camera = Camera(SIZE, LENSES[lens][0], (651.3, 468.9), LENSES[lens][1], 1.004)
     values = list(camera.lens.values)
@@ -230,7 +231,9 @@ def test_pycolmap_projects_as_we_do(name: str) -> None:
 
 
 def test_sony_boards(sony_boards: BoardDetections) -> None:
-    """OpenCV on these corners, k1 and k2 only: 0.138 px and 702.59; on its own 0.162 px, 700.93; published: 701.0."""
+    """OpenCV with these corners, k1 and k2 only: 0.138 px and 702.59; with its own 0.162 px,
+    700.93; published: 701.0.
+    """
     assert len(sony_boards.observations.views) == 13
     fixed = {"p1": 0.0, "p2": 0.0, "k3": 0.0}
     options = Options(usual_camera=False, lens="brown", free_aspect=True, fixed=fixed, as_built="as drawn")
@@ -242,7 +245,7 @@ def test_sony_boards(sony_boards: BoardDetections) -> None:
 
 @pytest.mark.thorough
 def test_gopro_boards(gopro_boards: BoardDetections) -> None:
-    """OpenCV with three radial coefficients, on its own corners: 0.5235 px and 560.07; some are 2 px and more off."""
+    """OpenCV with three radial coefficients and its own corners: 0.5235 px and 560.07; some are 2 px and more off."""
     observations = gopro_boards.observations
     assert len(observations.views) >= 35
     fixed = {"p1": 0.0, "p2": 0.0}  # as OpenCV, which takes boards as drawn
@@ -264,7 +267,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.mark.thorough
 def test_quick_form_side_by_side(tmp_path: Path) -> None:
-    """By OpenCV as it is here, on the set of data/opencv_left and on two inputs."""
+    """With this Python's OpenCV, the set of data/opencv_left, and two inputs."""
     path = tmp_path / "peers.json"
     command = [sys.executable, str(ROOT / "scripts" / "peers.py"), "--quick", "--splits", "1", "--jobs", "1"]
     asked = [*command, "--peers", "opencv", "--json", str(path)]
@@ -275,7 +278,7 @@ def test_quick_form_side_by_side(tmp_path: Path) -> None:
     assert left_px["opencv"] == pytest.approx(0.169, abs=0.01)  # 0.168 measured of the corners that count
     assert left_px["ours"] < 0.75 * left_px["opencv"]  # 0.62: the board is not as drawn
     (apart,) = (row["numbers"] for row in found["truth"] if row["peer"] == "opencv")
-    assert apart > 1.3  # 2 measured: the board's errors are in no number of OpenCV's
+    assert apart > 1.3  # 2 measured: OpenCV has no number for the board's errors
     said = {(row["fault"], row["peer"]): row for row in found["lies"]}
     assert not any(said["sound", peer]["wrong"] for peer in ("ours", "opencv"))
     assert said["repeated picture", "ours"]["notices"] == "named"
@@ -285,6 +288,6 @@ def test_quick_form_side_by_side(tmp_path: Path) -> None:
 def test_page_is_made_of_the_stored_run() -> None:
     stored = json.loads((ROOT / "docs" / "peers.json").read_text(encoding="utf-8"))
     assert (ROOT / "docs" / "peers.md").read_text(encoding="utf-8") == page.made(stored)
-    assert len(stored["environment"]["versions"]) > 5  # five peers and we
+    assert len(stored["environment"]["versions"]) > 5  # five peers and ceres-cal
     assert len({row["set"] for row in stored["prediction"] if "rms_px" in row}) >= 6
-    assert len({row["fault"] for row in stored["lies"]}) == 11  # ten, and the sound one
+    assert len({row["fault"] for row in stored["lies"]}) == 11  # ten, and the correct one

@@ -1,4 +1,4 @@
-"""Rendered photographs: lines, corners and rings lie where the model says, and the truth beside them is true."""
+"""Rendered photographs: lines, corners and rings agree with the model, and their truth is correct."""
 
 import json
 from dataclasses import replace
@@ -35,7 +35,7 @@ PLAIN = Photography(
 
 
 def column_middles(paint: Array, near: Array) -> Array:
-    """For each pixel (N, 2) on a line that is rather level: how far below it the paint's middle in its column lies."""
+    """For each pixel (N, 2) on a nearly horizontal line: distance of the paint's middle below it in its column."""
     columns, rows = np.round(near).astype(int).T
     window = rows[:, None] + np.arange(-9, 10)
     share = paint[window, columns[:, None]]
@@ -57,7 +57,7 @@ def test_painted_lines_lie_where_the_model_says(lens: str) -> None:
         inside &= np.minimum(np.abs(there - there[0]), np.abs(there - there[-1])).max(axis=1) > 20.0
         rows = np.flatnonzero(inside & (np.abs(slope) < 1.0))
         level = there[rows, 1] + (np.round(there[rows, 0]) - there[rows, 0]) * slope[rows]
-        cv2.GaussianBlur(canvas, (0, 0), 0.7 * SUBPIXELS, canvas)  # or the column's own squares are seen
+        cv2.GaussianBlur(canvas, (0, 0), 0.7 * SUBPIXELS, canvas)  # otherwise the column's own squares are visible
         found.append(column_middles(averaged(canvas).astype(float), there[rows]) - level)
     error = np.concatenate(found)
     assert len(error) > 3000
@@ -153,7 +153,7 @@ def test_robots_stand_up_and_hide_lines() -> None:
             hidden += 1
             assert shot.hides(pixels).all() or last - first < 0.03
     assert hidden >= 5
-    # What is not hidden is as bright as paint in the middle of the line.
+    # Visible parts are as bright as paint in the middle of the line.
     seen = posed.project(curve_points(field.curves["HalfwayLine"], 0, 600))
     seen = seen[np.all((seen > 2.0) & (seen < np.array(posed.image_size) - 3.0), axis=1)]
     around = [seen + step for step in ((0.0, 0.0), (3.0, 0.0), (-3.0, 0.0), (0.0, 3.0), (0.0, -3.0))]

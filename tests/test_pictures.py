@@ -1,4 +1,4 @@
-"""Straight images, top views and overlays: every pixel from where the camera says, and nothing invented."""
+"""Undistorted images, top views and overlays: every pixel from where the camera model maps it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_the_rectangles_are_opencv_s(k1: float) -> None:
 
 
 def _edges(matrix: Array, size: tuple[int, int]) -> Array:
-    """Where an image ends on the plane at depth 1."""
+    """The border of an image on the plane at depth 1."""
     ends = np.array([[-0.5, -0.5], np.array(size) - 0.5])
     return np.asarray((ends - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]).ravel()
 
@@ -214,7 +214,7 @@ def test_a_top_view_s_pixel_shows_its_place(lens: str, height_m: float) -> None:
     places = grid.places((np.column_stack([column, row]) + 0.5) / warp.fine - 0.5)
     expected = original.project(np.column_stack([places, np.full(500, height_m)]))
     found = np.column_stack([warp.x[row, column], warp.y[row, column]])
-    assert np.max(np.abs(found - expected)) < 0.02  # 0.001: between neighbours where squares are finer than pixels
+    assert np.max(np.abs(found - expected)) < 0.02  # 0.001: interpolation where squares are finer than pixels
 
 
 @given(
@@ -301,7 +301,7 @@ def test_the_real_field_s_overlay_lies_on_the_paint(tigers_field: tuple[Path, Fi
     for name in ("BottomTouchLine", "RightGoalLine", "RightPenaltyStretch", "RightFieldRightPenaltyStretch"):
         middle, left, right = model.lines[names.index(name)]
         inside = np.all((middle > 20.0) & (middle < np.array(model.image_size) - 20.0), axis=1)
-        inside &= np.linspace(0.0, 1.0, len(inside)) > 0.25  # writing lies over the others
+        inside &= np.linspace(0.0, 1.0, len(inside)) > 0.25  # text covers the others
         beside = 2.0 * left - middle, 2.0 * right - middle
         paint, *carpet = (_levels(grey, pixels[inside]) for pixels in (middle, *beside))
         assert np.mean(paint > np.maximum(*carpet) + 20.0) > 0.75, name  # 0.9: seams, and crossing lines
@@ -360,7 +360,7 @@ def test_the_field_is_shown_before_boards() -> None:
 
 
 def test_photographs_of_frames_and_stations() -> None:
-    """By their names; by their folders where these are called like stations or cameras."""
+    """By their names; by their folders if these have the names of stations or cameras."""
     observations = simulate(two_cameras(LENSES[0])).observations
     frame = observations.views[0].frame
     west, east, alone, again = (Path(f"{folder}/{frame}.png") for folder in ("a/west", "a/east", "a", "b"))

@@ -1,4 +1,4 @@
-"""Geometry that cannot be: mirrored pictures of a flat scene fit it perfectly, and are refused with their cause."""
+"""Impossible geometry: mirrored pictures of a flat scene fit perfectly, and are refused with their cause."""
 
 from __future__ import annotations
 
@@ -71,14 +71,14 @@ def test_the_closed_form_is_refused_too() -> None:
 
 
 def test_a_custom_target_in_the_world_is_a_floor_too() -> None:
-    """With poles on it: what stands on the floor cannot be mirrored, and the picture still is refused."""
+    """With poles: objects on the floor cannot be mirrored, and the picture is refused, too."""
     seen = simulate(SCENES["radial-3-5/poles"](), NOISE).observations
     text = refusal(with_pixels(seen, MIRRORED["mirrored"]), Options(powers=(3, 5)))
     assert "under the floor" in text and ANY in text
 
 
 def small_field() -> Target:
-    """Points within what both a wide and a high image show."""
+    """Points that both a wide and a high image show."""
     places = [(x, y) for x in np.linspace(-1.5, 1.5, 6) for y in np.linspace(-1.5, 1.5, 6)]
     return custom({f"{i}": (float(x), float(y), 0.0) for i, (x, y) in enumerate(places)}, {})
 
@@ -92,7 +92,7 @@ def over_a_small_field() -> Scene:
 
 
 def test_the_principal_point_tells_swapped_axes() -> None:
-    """Where swapped pixels stay inside the image: at (469, 651), the image's centre being (639, 479)."""
+    """For swapped pixels inside the image: it is at (469, 651), while the image's centre is (639, 479)."""
     seen = simulate(over_a_small_field(), NOISE).observations
     inside = np.all(seen.points.pixels < 960.0, axis=1)
     columns = {name: column[inside] for name, column in vars(seen.points).items()}
@@ -111,7 +111,7 @@ def test_boards_in_the_air_are_seen_from_either_side() -> None:
 
 
 def judged(points: dict[str, tuple[float, float, float]], pose: Pose) -> None:
-    """Ask of a camera at that pose, which is taken to have seen these points."""
+    """Judges a camera at this pose that has seen these points."""
     target = custom(points, {})
     above = Camera((1280, 960), 800.0, (640.0, 480.0), camera("radial-3").lens)
     seen = simulate(
@@ -123,7 +123,7 @@ def judged(points: dict[str, tuple[float, float, float]], pose: Pose) -> None:
 
 
 def turned_upwards(height_m: float) -> Pose:
-    """A camera at that height that looks straight up."""
+    """A camera at this height that looks straight up."""
     return Pose(np.eye(3), np.array([0.0, 0.0, -height_m]))
 
 
@@ -153,9 +153,9 @@ def test_what_is_seen_lies_behind() -> None:
 def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Turned about another centre than the lens's, a strong lens fits no homography; another place was taken for it.
+    """Rotated about another centre than the lens's, a strong distortion fits no homography; another place was chosen.
 
-    A start that nothing stated can mend is sought no second time, whatever is stated.
+    If no prior can correct an initial estimate, it is searched only once, whatever is stated.
     """
     sought = Mock(wraps=initialise._start_camera)
     monkeypatch.setattr(initialise, "_start_camera", sought)
@@ -164,6 +164,6 @@ def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
     scene = field_scene(ssl_field("B"), strong, world, points=(), spacing_m=0.1)
     swapped = with_pixels(simulate(scene, NOISE, seed).observations, lambda pixels: pixels[:, ::-1].copy())
     shown = swapped.curves.pixels[:, 1] < 959.0
-    stated = Options(priors=(Prior("station", "camera", "height_m", (5.2,), (0.02,)),))  # it was sought 43 times
+    stated = Options(priors=(Prior("station", "camera", "height_m", (5.2,), (0.02,)),))  # it was searched 43 times
     text = refusal(swapped.part(np.zeros(0, bool), shown), stated)
     assert "mirrored" in text and "x and y are swapped" in text and sought.call_count == 1

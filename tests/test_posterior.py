@@ -1,4 +1,4 @@
-"""Covariance of everything: against pyceres' own, what is unknown, and what a file keeps of it."""
+"""The whole covariance: compared with pyceres's, unknown directions, and its form in a file."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from ceres_cal.problem.structure import Tolerance
 from ceres_cal.simulate import Disturbance, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
-WEIGHTING = Weighting(0.3, 0.3, "cauchy", 3.0)  # a loss whose bend the blocks leave out, as the posterior does
+WEIGHTING = Weighting(0.3, 0.3, "cauchy", 3.0)  # neither blocks nor posterior include the curvature of this loss
 
 
 def problem(name: str, **more: Any) -> tuple[Problem, Estimate]:
-    """A scene solved, its height known to 10 mm, its camera's principal point to 2 px."""
+    """A scene that is solved, with its height known to 10 mm and its principal point to 2 px."""
     scene = SCENES[name]()
     lens = next(iter(scene.cameras.values())).lens
     camera, station = next(iter(scene.cameras)), next(iter(scene.stations))
@@ -57,7 +57,7 @@ def problem(name: str, **more: Any) -> tuple[Problem, Estimate]:
 
 
 def step_of_block(kind: str, name: str, estimate: Estimate, layout: Layout) -> Array:
-    """What a step of the solver's block is in the numbers of `quantities`."""
+    """A step of the solver's block in the numbers of `quantities`."""
     if kind == "camera":
         return np.diag(1.0 / intrinsics_scales(estimate.cameras[name])[layout.free[name]])
     if kind == "structure":
@@ -71,7 +71,7 @@ def step_of_block(kind: str, name: str, estimate: Estimate, layout: Layout) -> A
 
 
 def covariance_of_pyceres(whole: Problem, estimate: Estimate) -> dict[tuple[str, str], Array]:
-    """Covariance of each block by pyceres, nothing eliminated, no kernel of `information` in it."""
+    """Covariance of each block by pyceres, without elimination and without the kernels of `information`."""
     layout = whole.layout
     blocks = packed(estimate, layout, frozenset())
     ceres, run = pyceres.Problem(), Run()
@@ -124,7 +124,7 @@ def test_covariance_is_that_of_pyceres(name: str, tolerances: dict[str, Toleranc
 
 
 def test_the_roll_of_a_ring_sheet_is_unknown_and_nothing_else() -> None:
-    """An exact null direction: turned about its axis a sheet of rings looks the same."""
+    """An exact null direction: a sheet of rings looks the same after a rotation about its axis."""
     posterior = make_posterior(information(*problem("radial-2-3/rings-field")), np.inf)
     sheet = posterior.placement("rings")
     assert np.isinf(sheet.sd[5]) and np.all(np.isfinite(sheet.sd[:5])) and np.all(sheet.sd[:5] > 1e-6)
@@ -132,7 +132,7 @@ def test_the_roll_of_a_ring_sheet_is_unknown_and_nothing_else() -> None:
 
 
 def test_an_unknown_number_makes_unknown_what_depends_on_it_alone() -> None:
-    """Two numbers of which only the sum is known, a third by itself, a fourth not at all."""
+    """Two numbers with only their sum known, a known third one, and an unknown fourth one."""
     total = np.array([1.0, 1.0, 0.0, 0.0])
     alone = np.array([0.0, 0.0, 1.0, 0.0])
     spread = Spread.of(25.0 * np.outer(total, total) + 4.0 * np.outer(alone, alone), 1e6 * np.ones(4))
@@ -154,7 +154,9 @@ def test_units_do_not_matter(scale: float) -> None:
 
 
 def test_placements_follow_what_their_station_does_not_know() -> None:
-    """Boards before a station that nothing ties to the height: as unknown in the world as it is, not to each other."""
+    """Boards in front of a station without a known height: unknown in the world like the station,
+    but not relatively.
+    """
     whole, estimate = problem("radial-2-3/field-boards")
     boards = whole.of_sights(np.array([i for i, key in enumerate(whole.sights.keys) if key.placement is not None]))
     posterior = make_posterior(information(replace(boards, priors=()), estimate), np.inf)
@@ -199,7 +201,7 @@ def test_a_step_and_back() -> None:
 
 
 def test_a_step_of_a_pose_near_half_a_turn() -> None:
-    """Rotation vectors jump there, turns do not."""
+    """Rotation vectors jump there, rotations do not."""
     _, estimate = problem("radial-2-3/field-boards")
     station = replace(estimate.stations["overhead"], cam_from_world=Pose.exp([np.pi - 1e-4, 0.0, 0.0, 0.1, 0.2, 4.0]))
     here = replace(estimate, stations={"overhead": station})
@@ -210,7 +212,7 @@ def test_a_step_of_a_pose_near_half_a_turn() -> None:
 
 @pytest.mark.parametrize("name", ["radial-2-3/corners", "radial-2-3/lines"])
 def test_where_errors_go_together_the_best_lies_nearer_to_what_is_stated(name: str) -> None:
-    """Solved for with observations that count as much less, everything moves by as much as was said."""
+    """A solve with accordingly less weight for the observations moves everything by the predicted amount."""
     whole, found = problem(name)
     scales = 0.3, 3.0  # px
     short, wide = (replace(whole, weighting=Weighting(one, one, "trivial", 3.0)) for one in scales)
@@ -228,7 +230,7 @@ def test_where_errors_go_together_the_best_lies_nearer_to_what_is_stated(name: s
 
 @pytest.mark.parametrize("noise_scale", ["estimate", "stated"])
 def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
-    """At the noise that was found, four times what was stated, or at the stated one."""
+    """With the estimated noise, four times the stated one, or with the stated one."""
     observations = simulate(SCENES["radial-2-3/lines"](), NOISE, 1).observations
     stated = replace(observations, curves=replace(observations.curves, sigma_px=0.25 * observations.curves.sigma_px))
     told = calibrate(

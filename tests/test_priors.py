@@ -1,4 +1,4 @@
-"""What is known beforehand, in one form: stated numbers, tolerances and posteriors."""
+"""Prior knowledge in one form: stated numbers, tolerances and posteriors."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_tolerances_are_priors_of_mean_nought() -> None:
 
 
 def known_prior(estimate: Estimate, seed: int = 0) -> GaussianPrior:
-    """Of everything free, all of it together."""
+    """A prior on all free numbers together."""
     keys = [*intrinsic_keys("overhead", estimate.cameras["overhead"].lens), *pose_keys("station", "overhead")]
     keys += [Key.of_structure(name) for name in estimate.structure.names]
     rng = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def test_offsets_are_the_steps_from_the_mean(seed: int) -> None:
 
 
 def test_turns_count_from_the_mean_even_near_half_a_turn() -> None:
-    """About the camera's own axes; rotation vectors jump there, turns do not."""
+    """About the camera's own axes; rotation vectors jump there, rotations do not."""
     estimate = estimated()
     pose = Pose.exp([np.pi - 1e-4, 0.0, 0.0, 0.1, 0.2, 4.0])
     here = replace(estimate, stations={"overhead": Station("overhead", pose)})
@@ -174,10 +174,10 @@ def test_given_and_without() -> None:
 
 @given(st.integers(0, 2**31))
 def test_given_where_an_estimate_has_the_others(seed: int) -> None:
-    """As the whole prior rises from its least with those held there, in whichever way the rest moves."""
+    """The rise of the whole prior above its minimum with those numbers fixed, for any change of the others."""
     estimate, rng = estimated({"field": Tolerance(lines_m=0.01)}), np.random.default_rng(seed)
     prior = known_prior(estimate, seed)
-    small = {**SIZES, "rad": 1e-5}  # turns one after another are not their sum
+    small = {**SIZES, "rad": 1e-5}  # rotations do not add up
     sizes = np.array([small.get(key.unit, 1e-2) for key in prior.keys])
     held = moved(estimate, prior.keys, sizes * rng.standard_normal(len(prior.keys)))
     free = [key for number, key in enumerate(prior.keys) if number % 3]
@@ -188,7 +188,7 @@ def test_given_where_an_estimate_has_the_others(seed: int) -> None:
 
 
 def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
-    """The other numbers of the prior still count, with those held as they are; what is known uses up no equation."""
+    """The other numbers of the prior still count, given the fixed ones; a prior uses up no equation."""
     estimate, seen = estimated(), observed()
     options = Options(lens="radial", usual_camera=False, fixed={"cx": 651.3})
     prior = known_prior(estimate)
@@ -201,11 +201,11 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     assert replace(problem, priors=(nobody,)).priors_at(estimate) == []
 
 
-# ---- what is usual --------------------------------------------------------------------------------------------------
+# ---- usual cameras --------------------------------------------------------------------------------------------------
 
 
 def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
-    """Not where it is stated, held back by the options, or known by an earlier calibration."""
+    """Not if it is stated, fixed by the options, or known from an earlier calibration."""
     seen, structure, options = observed(), estimated().structure, replace(RADIAL, usual_camera=True)
     (usual,) = (one for one in gather_priors(seen, options, structure) if one.is_usual)
     assert [key.quantity for key in usual.logs] == ["phi"]
@@ -230,7 +230,7 @@ def test_every_lens_is_little_decentred_as_is_usual(lens: str) -> None:
 
 @given(st.floats(0.05, 20.0))
 def test_the_usual_phi_pulls_as_its_cost_rises(ratio: float) -> None:
-    """The normal distribution in its place has the cost's own derivative, for lenses of any phi."""
+    """The linearised prior has the derivative of its cost, for lenses of any phi."""
     seen, estimate = observed(), estimated()
     every = gather_priors(seen, replace(RADIAL, usual_camera=True), estimate.structure)
     whole = next(one for one in every if one.logs)
@@ -250,7 +250,7 @@ def test_the_usual_phi_pulls_as_its_cost_rises(ratio: float) -> None:
 
 @given(st.floats(0.0, 1e4))
 def test_what_is_usual_gives_way(off: float) -> None:
-    """The farther off, the less it pulls: Cauchy's weight, of which the pull is greatest at its bend."""
+    """The farther off, the weaker the pull: Cauchy's weight, with the largest pull at its bend."""
     key, estimate = Key("camera", "overhead", "aspect", "1"), estimated()
     aspect = estimate.cameras["overhead"].aspect
     prior = GaussianPrior(Information.of_sigmas({key: 1e-3}), np.array([aspect - 1e-3 * off]), gives_way=True)

@@ -1,4 +1,4 @@
-"""The fit of edges and painted lines to raw pixels: unbiased by blur, slope and light, with honest sigmas."""
+"""The fit of edges and painted lines to raw pixels: no bias by blur, slope and light, and honest sigmas."""
 
 from types import SimpleNamespace
 
@@ -17,11 +17,11 @@ COUNT = 200
 def stripe(
     normal: Array, offset: float, blur: float, left: float = 40.0, right: float = 40.0, slope: float = 0.0
 ) -> Array:
-    """(61, 61) grey levels of a bright stripe, drawn finely and averaged over each square pixel."""
+    """(61, 61) grey levels of a bright stripe, sampled finely and averaged over each square pixel."""
     fine = 9
     axis = (np.arange(61 * fine) + 0.5) / fine - 0.5 - 30.0
     t = axis[None, :] * normal[0] + axis[:, None] * normal[1] - offset
-    # The pixel's own square comes from averaging; the small squares' too, which is 1 / 12 / fine^2 of variance.
+    # The averaging adds the pixel's own square, and also the small squares with a variance of 1 / 12 / fine^2.
     s = np.sqrt(blur**2 - 1.0 / 12.0 / fine**2)
     light = left + slope * t
     light += (190.0 - left) * normal_cdf((t + 0.5 * WIDTH_PX) / s)
@@ -30,7 +30,7 @@ def stripe(
 
 
 def fitted(image: Array, normal: Array, blur: float) -> tuple[float, float]:
-    """Offset and sigma of one stripe through the middle."""
+    """Offset and sigma of one stripe through the centre."""
     edges = 0.5 * WIDTH_PX * np.array([[-1.0, 1.0]])
     windows = cut_windows(image.astype(np.float32), np.array([[30.0, 30.0]]), normal[None], np.zeros(1), 6.0, 3)
     found = fit_profiles(windows, edges, np.hypot(blur, 12**-0.5), 2.0)
@@ -103,7 +103,7 @@ def test_sigma_is_the_scatter() -> None:
 
 def test_curves_bend() -> None:
     y, x = np.indices((61, 61)) - 30.0
-    radius = np.hypot(x, y + 40.0)  # a circle of 40 px radius whose lowest place is the middle
+    radius = np.hypot(x, y + 40.0)  # a circle of 40 px radius whose lowest point is the image's centre
     image: Array32 = (200.0 * normal_cdf((41.3 - radius) / 0.8)).astype(np.float32)
     normal = np.array([[0.0, 1.0]])
     bent = cut_windows(image, np.array([[30.0, 30.0]]), normal, np.array([-1.0 / 40.0]), 5.0, 4)
@@ -123,7 +123,7 @@ def test_windows_at_the_border_and_without_light_tell_nothing() -> None:
 
 
 def test_a_blur_is_told_where_nothing_is_bright() -> None:
-    """Places that are all darker than their surroundings: half of a negative quantile is above all of them."""
+    """All places are darker than their surroundings, so that half of a negative quantile is above all of them."""
     image = 255.0 - stripe(np.array([1.0, 0.0]), 0.0, 1.0)
     places = np.column_stack([np.full(40, 30.0), np.linspace(12.0, 48.0, 40)])
     normals = np.tile([1.0, 0.0], (40, 1))

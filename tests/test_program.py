@@ -1,4 +1,4 @@
-"""The commands as programs: exit codes say how the work ended, whatever becomes of the streams and of the parent."""
+"""The commands as programs: correct exit codes, whatever happens to the streams and to the parent."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 PROGRAM = "import sys; from ceres_cal.cli import main; sys.exit(main())"
 STREAMS = ("open", "closed", "full", "broken")
 
-# Forks itself for each call, after one in the same process: to start and import takes longer than what is asked.
+# Forks itself for each call after a first one, since starting and importing takes longer than the call.
 FORKING = """
 import contextlib, io, json, os, sys
 from ceres_cal.cli import main
@@ -58,7 +58,7 @@ def codes_of(calls: list[tuple[list[str], tuple[str, ...]]]) -> list[int]:
 
 
 def test_streams_do_not_change_an_exit_code() -> None:
-    """A script refits where `check` exits with 1: a failure that nobody can read must stay a failure."""
+    """Scripts refit if `check` exits with 1, so a failure without a readable message must stay a failure."""
     wanted = {
         ("check", "/nonexistent", "/nonexistent"): 2,
         ("check", "/nonexistent", "/nonexistent", "--json"): 2,
@@ -86,7 +86,7 @@ def test_a_camera_that_moved_is_1(files_of_a_move: Path) -> None:
 
 
 def test_what_is_opened_next_is_no_standard_stream(tmp_path: Path) -> None:
-    """Where descriptor 2 is free, a file that is written would be what libraries print on."""
+    """If descriptor 2 is free, a file opened for output would get the libraries' messages."""
     program = (
         "import os; from ceres_cal.cli.terminal import as_a_program; as_a_program()\n"
         "number = os.open('file', os.O_WRONLY | os.O_CREAT); assert number > 2, number\n"
@@ -105,7 +105,7 @@ def test_a_lost_answer_is_said() -> None:
 
 
 def test_a_pipe_that_does_not_block_gets_all() -> None:
-    """As those of Node.js: the whole answer comes, though the pipe holds a part of it at a time."""
+    """Like the pipes of Node.js: the whole answer arrives, although the pipe holds only a part at a time."""
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     words = [sys.executable, "-c", PROGRAM, "targets", "ssl-a", "--json"]
@@ -132,7 +132,7 @@ if __name__ == "__main__":
 
 
 def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
-    """In the middle of their work; those of `batch --jobs` and of all others come from `base.executing`."""
+    """During their work; those of `batch --jobs` and all others are made by `base.executing`."""
     (tmp_path / "working.py").write_text(WORKING)
     (pids := tmp_path / "pids").mkdir()
     process = subprocess.Popen([sys.executable, str(tmp_path / "working.py"), str(pids)], env=ENVIRONMENT)
@@ -143,7 +143,7 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
 
 
 def runs(pid: str) -> bool:
-    """Neither gone nor only waiting for somebody to ask how it ended."""
+    """Whether a process runs: it is neither gone nor a zombie."""
     try:
         return bool(Path("/proc", pid, "cmdline").read_bytes())
     except OSError:

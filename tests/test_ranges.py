@@ -1,4 +1,4 @@
-"""What a stated number can be: millimetres given for metres, sigmas finer than anything measured."""
+"""Possible ranges of stated numbers: millimetres instead of metres, sigmas finer than any measurement."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_they_are_asked_of_a_files_priors_and_of_a_refit_too() -> None:
 @given(factor=st.floats(0.05, 10.0), sigma=st.floats(1e-6, 1e3), scale=st.floats(1e-3, 1e3))
 @settings(max_examples=50)
 def test_the_range_of_a_height_goes_with_the_scene(factor: float, sigma: float, scale: float) -> None:
-    """A scene of any size takes the heights that its own camera may have, and no thousandfold of them."""
+    """A scene of any size accepts heights that its own camera may have, but not a thousand times these."""
     places = {name: tuple((scale * np.array(place)).tolist()) for name, place in SEEN.targets["field"].points.items()}
     points = SEEN.part(np.ones(len(SEEN.points), bool), np.zeros(len(SEEN.curves), bool))
     sized = replace(points, targets={**SEEN.targets, "field": custom(places)})

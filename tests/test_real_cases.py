@@ -1,4 +1,4 @@
-"""Inputs that once ended badly: its README says what is right of each file of `cases` in the folder of real data."""
+"""Inputs that once failed: the README in the folder of real data says what is right for each file of `cases`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HELD = ("--lens", "brown", *(part for name in ("k1", "k2", "k3", "p1", "p2") for
 
 @pytest.fixture(scope="session")
 def case(real_data: Path) -> Callable[[str], Path]:
-    """Where a case lies, by the name of its file."""
+    """Path of a case, by the name of its file."""
 
     def place(name: str) -> Path:
         path = real_data / "cases" / name
@@ -53,7 +53,7 @@ def test_lens_none_field_keeps_its_stated_height(case: Callable[[str], Path]) ->
 
 
 def test_a_wrong_height_is_set_aside(case: Callable[[str], Path]) -> None:
-    """It was named, and phi 654.8 ± 2.5 px stood beside it."""
+    """It was named, but phi was still reported as 654.8 ± 2.5 px."""
     calibration = calibrate(Observations.load(case("height_wrong.json")))
     assert [one.quantity for one in calibration.conflicts] == ["height"]
     phi, height = (
@@ -64,21 +64,21 @@ def test_a_wrong_height_is_set_aside(case: Callable[[str], Path]) -> None:
 
 
 def test_swapped_pixels_of_boards_are_no_reason_for_distrust(case: Callable[[str], Path]) -> None:
-    """What other lenses do in corners that no board reached turned the whole picture: known to 1114 px, no longer."""
+    """Other lenses differ in corners that no board reached, which rotated the whole picture: 1114 px of uncertainty."""
     observations = Observations.load(case("swapped.json"))
     calibration = calibrate(observations)
     phi = calibration.uncertainty.verdict("camera", "camera", "phi")
     assert phi.value == pytest.approx(800.0, abs=2.0 * phi.sd) and phi.sd < 3.0
     quality = quality_of(calibration, observations)
     assert quality.observed_px < 8.0 and judge_quality(quality).level != "no"  # 5.5 measured
-    (warning,) = calibration.warnings  # at (479, 638), the middle of a picture of 960 x 1280
+    (warning,) = calibration.warnings  # the principal point is (479, 638), the centre of a picture of 960 x 1280
     assert "principal point lies 226 px from the middle" in warning and "that x comes before y" in warning
 
 
 @pytest.mark.parametrize("share, off_px", [(0.0, 74.0), (0.0, 8.0), (0.2, 20.0)])
 def test_outliers_do_not_decide_the_lens(case: Callable[[str], Path], share: float, off_px: float) -> None:
-    """Lenses are compared over the rows that one robust solve keeps, and by the logarithm of what groups leave:
-    one stray corner of 408 once left kannala-brandt k1, at .37 px.
+    """Lenses are compared with the rows that one robust solve keeps, and by the logarithm of the groups' residuals: one
+    stray corner of 408 once led to kannala-brandt k1, with 0.37 px.
     """
     observations, rng = Observations.load(case("stray_corner.json")), np.random.default_rng(5)
     strays = rng.choice(len(observations.points), max(1, int(share * len(observations.points))), replace=False)
@@ -154,7 +154,7 @@ def test_exact_data_gives_the_exact_camera(case: Callable[[str], Path], tmp_path
 
 
 def test_lines_in_two_directions_are_enough(case: Callable[[str], Path]) -> None:
-    """two_by_two_lines: a plane's pose follows from two lines in each of two directions, and an arc."""
+    """two_by_two_lines: two lines in each of two directions determine a plane's pose, and an arc is added."""
     held = Options(lens="brown", fixed=dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0), free_principal_point=False)
     found = calibrate(Observations.load(case("two_by_two_lines.json")), held)
     assert found.fit.curves_rms_px < 3.0  # 0.8

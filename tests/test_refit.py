@@ -70,7 +70,7 @@ def observations() -> Observations:
 
 
 def only(observations: Observations, *names: str) -> Observations:
-    """What was observed of these curves, and nothing else."""
+    """The observations of only these curves."""
     known = observations.targets["field"].curve_names
     rows = np.isin(observations.curves.feature, [known.index(name) for name in names])
     none = np.zeros(len(observations.points), dtype=bool)
@@ -79,7 +79,7 @@ def only(observations: Observations, *names: str) -> Observations:
 
 @pytest.fixture(scope="module")
 def two_cameras() -> tuple[Calibration, dict[str, Station]]:
-    """Two cameras over one field that is not as drawn: its tolerances tie them together."""
+    """Two cameras above one field that differs from its drawing; its tolerances connect them."""
     cameras, stations = side_by_side(CAMERA)
     scene = field_scene(FIELD, cameras, stations, frames=2, spacing_m=0.15)
     options = Options(usual_camera=False, lens="radial", tolerances={"field": Tolerance(lines_m=0.005)})
@@ -90,7 +90,7 @@ def two_cameras() -> tuple[Calibration, dict[str, Station]]:
 
 
 def test_the_prior_says_what_its_matrix_says(two_cameras: tuple[Calibration, dict[str, Station]]) -> None:
-    """Residual and Jacobian of the block, against r = root (x - mean) by differences."""
+    """Residual and Jacobian of the block, compared with r = root (x - mean) by differences."""
     calibration, _ = two_cameras
     posterior, estimate = calibration.posterior, calibration.estimate
     assert posterior is not None
@@ -142,7 +142,7 @@ def test_integrating_out_is_the_inverse_of_the_covariance(calibration: Calibrati
 
 
 def test_the_new_posterior_is_data_and_prior(calibration: Calibration, observations: Observations) -> None:
-    """What is known of phi can only grow, and hardly does from a floor seen from above."""
+    """The information about phi can only grow, and hardly does for a floor seen from above."""
     result = refit(calibration, observations)
     before, after = (c.uncertainty.posterior.sd_of("camera", "overhead", "phi") for c in (calibration, result))
     assert 0.8 * before < after < before
@@ -187,7 +187,7 @@ def test_two_lines_and_an_arc_are_enough_after_a_small_move(calibration: Calibra
 
 
 def test_few_lines_do_not_tell_a_large_move(calibration: Calibration) -> None:
-    """One corner, two parallel lines and a bit of the circle have a second solution, 0.8 m from the truth."""
+    """One corner, two parallel lines and a part of the circle have a second solution, 0.8 m from the truth."""
     few = thinned(seen(random_move(26), NOISE, 5026).observations, CORNERS[:3], 10, 26)
     with pytest.raises(DegenerateError, match="7 equations"):
         refit(calibration, few)
@@ -217,13 +217,13 @@ def test_a_refit_of_a_refit_changes_nothing(
 
 
 def test_the_observations_of_a_calibration_are_no_new_ones(observations: Observations) -> None:
-    """Without what is usual of cameras they say less: of 549 ± 109 px a phi of 682 ± 399 px was left."""
+    """Without the priors on usual cameras they give less: 549 ± 109 px for phi became 682 ± 399 px."""
     with pytest.raises(InputError, match="the calibration was made from these observations"):
         refit(calibrate(observations, Options(lens="radial")), observations)
 
 
 def test_the_prior_of_an_older_file_is_the_same(calibration: Calibration, observations: Observations) -> None:
-    """Files of 0.1 have its mean as the cameras, stations and structure that it is around."""
+    """Files of 0.1 store its mean as the cameras, stations and structure around which it is."""
     refitted, estimate = refit(calibration, observations).refitted, calibration.estimate
     assert refitted is not None
     file = PriorFile.of(refitted.prior)
@@ -257,7 +257,7 @@ def test_another_zoom_is_named_where_a_move_was_stated(calibration: Calibration)
         refit(calibration, zoomed, "pose")
 
 
-@pytest.mark.parametrize("zoom", partly([0.7, 0.99], [0.99]))  # of one percent a pose alone would take up two thirds
+@pytest.mark.parametrize("zoom", partly([0.7, 0.99], [0.99]))  # a pose alone would absorb two thirds of one percent
 def test_another_zoom_is_found(calibration: Calibration, zoom: float) -> None:
     camera = replace(CAMERA, phi=zoom * CAMERA.phi)
     result = refit(calibration, seen(FAR, DAY, 2, camera=camera).observations)
@@ -267,7 +267,7 @@ def test_another_zoom_is_found(calibration: Calibration, zoom: float) -> None:
 
 
 def test_few_clicks_accuse_no_lens(calibration: Calibration) -> None:
-    """Five clicks of a camera that stands still: 7 of 20 said another zoom or iris, and up to 3 m of it."""
+    """Five clicks of an unmoved camera: 7 of 20 were reported as another zoom or iris, with errors of up to 3 m."""
     changed = 0
     for seed in range(20):
         found = seen(HOME, DAY, seed).observations
@@ -283,8 +283,8 @@ def test_few_clicks_accuse_no_lens(calibration: Calibration) -> None:
 def test_what_clicks_do_not_tell_from_a_move_counts(
     calibration: Calibration, seed: int, most: float, tmp_path: Path
 ) -> None:
-    """Five clicks of a camera whose zoom was changed by 2 % as well: a move explains them nearly as well, and alone it
-    had places 2.7 and 1.7 stated radii off.
+    """Five clicks of a camera whose zoom also changed by 2 %. A move explains them nearly as well; with a move alone,
+    errors of places were 2.7 and 1.7 stated radii.
     """
     camera = replace(CAMERA, phi=0.98 * CAMERA.phi)
     found = seen(FAR, NOISE, seed, camera=camera).observations
@@ -302,7 +302,7 @@ def test_what_clicks_do_not_tell_from_a_move_counts(
 
 
 def _radii_off(found: Calibration, pose: Pose, camera: Camera) -> float:
-    """The largest error of a place at either height, in its stated radius."""
+    """The largest error of a place at both heights, over its stated radius."""
     most, truth = 0.0, camera.at(pose)
     for height_m in HEIGHTS_M:
         pixels = visible_pixels(truth_of(found, pose, camera), "overhead", field_places(), height_m)
@@ -313,7 +313,7 @@ def _radii_off(found: Calibration, pose: Pose, camera: Camera) -> float:
 
 
 def test_another_explanation_counts_where_phi_is_followed() -> None:
-    """What may be true besides is a component along phi there: bounds and standard deviations are those of both."""
+    """There another possible explanation is a component along phi: bounds and standard deviations include both."""
     found, _ = of_one_picture("weak", 2)
     before = found.uncertainty.posterior
     step = over(np.array([0.1]), [Key("station", "overhead", "x", "m")], before.keys)
@@ -327,7 +327,7 @@ def test_another_explanation_counts_where_phi_is_followed() -> None:
 
 
 def test_another_zoom_is_found_where_the_picture_is_noisier(calibration: Calibration) -> None:
-    """What a move alone is taken with, and a warning, is no reason to refuse another zoom: nothing was said to fit."""
+    """A warning that would do for a move must not exclude another zoom; the message was that nothing fits."""
     camera = replace(CAMERA, phi=0.97 * CAMERA.phi)
     dim = replace(DAY, points_sigma_px=1.8 * DAY.points_sigma_px, curves_sigma_px=1.8 * DAY.curves_sigma_px)
     found = seen(FAR, dim, 2, camera=camera).observations
@@ -385,7 +385,7 @@ def test_another_camera_is_said(calibration: Calibration, observations: Observat
 
 
 def test_few_clicks_are_noisier_rather_than_strays_or_another_lens(calibration: Calibration) -> None:
-    """Five to seven of 2 px after 0.3 px: a pose through some of them, or another lens through all, is less likely."""
+    """Five to seven clicks with 2 px after 0.3 px: a pose through some of them, or another lens, is less likely."""
     places = np.array([[x, y] for x in (200.0, 640.0, 1080.0) for y in (150.0, 480.0, 810.0)])
     truth, refused = CAMERA.at(MOVED).locate(places), 0
     for seed in range(8):
@@ -405,7 +405,7 @@ def test_few_clicks_are_noisier_rather_than_strays_or_another_lens(calibration: 
 
 
 def test_clicks_that_are_much_noisier_are_no_nonsense(calibration: Calibration) -> None:
-    """Nothing fitted at the noise of the calibration, 0.3 px: three of the four were refused."""
+    """Nothing fitted with the calibration's noise of 0.3 px: three of four were refused."""
     for seed in range(4):
         rng, found = np.random.default_rng(seed), seen(MOVED, NOISE, seed).observations
         chosen = np.isin(np.arange(len(found.points)), rng.permutation(len(found.points))[:9])
@@ -453,7 +453,7 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
     sd = np.array([posterior.sd_of(*key[:3]) for key in left])
     old = np.array([before.sd_of(*key[:3]) for key in left])
     assert np.all(np.abs(difference(result.estimate, calibration.estimate, left)) < 4.0 * old)
-    assert np.all(sd < 1.2 * old)  # 1.14 of phi: a refit takes one normal distribution in place of a mixture
+    assert np.all(sd < 1.2 * old)  # 1.14 of phi: a refit replaces a mixture by one normal distribution
     shift_m, turn = movement(result.estimate.stations["right"].cam_from_world, pose)
     assert shift_m < 0.05 and turn < 0.01  # 0.010 m, 0.0017 rad
     held = refit(calibration, observed, moved=["right"], options=RefitOptions(hold_others=True))
@@ -463,7 +463,7 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
 
 
 def test_a_station_that_moved_and_is_said_to_stay(two_cameras: tuple[Calibration, dict[str, Station]]) -> None:
-    """Where the other one was named, that had "another lens"."""
+    """If the other one was named instead, that one had "another lens"."""
     calibration, stations = two_cameras
     old = stations["right"].cam_from_world
     position = old.position + np.array([0.02, -0.02, 0.0])
@@ -495,7 +495,7 @@ def test_names_that_do_not_fit(calibration: Calibration, observations: Observati
         refit(replace(calibration, posterior=None), observations)
     views = tuple(replace(view, station="second") for view in observations.views)
     result = refit(calibration, replace(observations, views=views))
-    assert list(result.stations) == ["second"]  # the camera is not where it was
+    assert list(result.stations) == ["second"]  # the camera has moved
     assert result.refitted is not None and "is new" in result.refitted.explanation
     plan = make_plan(calibration, observations, "pose")
     assert plan.loosened("zoom") == {("camera", "overhead", "phi", "px")}
@@ -505,7 +505,7 @@ def test_names_that_do_not_fit(calibration: Calibration, observations: Observati
 def test_strays_are_neither_another_zoom_nor_mirrored_labels(
     calibration: Calibration, points: int, rows: int, seed: int
 ) -> None:
-    """Three of few points and a fifth of the rows are anywhere in the image; of 90 such scenes ten were refused."""
+    """Three of few points and a fifth of the rows are at random places; ten of 90 such scenes were refused."""
     rng = np.random.default_rng(seed)
     every = seen(MOVED, NOISE, seed, spacing_m=0.15).observations
     names = [every.targets["field"].point_names[feature] for feature in every.points.feature]
@@ -520,21 +520,21 @@ def test_strays_are_neither_another_zoom_nor_mirrored_labels(
 
 @pytest.mark.parametrize("seed", partly([0, 2, 9], [9]))
 def test_what_a_refit_states_holds_where_phi_is_hardly_known(seed: int) -> None:
-    """Also at robot height, where one normal distribution in place of a bent valley was 7 standard deviations off."""
+    """Also at robot height, where one normal distribution for a bent valley had errors of 7 standard deviations."""
     found, errors = of_one_picture("weak", seed)
     assert "overhead" in found.uncertainty.posterior.followed
     assert max(float(np.max(off / radius)) for off, _, radius in errors.values()) < 2.0  # at most 1.4 of 40 measured
 
 
 def test_how_far_a_camera_moved_is_not_said_where_its_height_is_not_known() -> None:
-    """Straight down a move of 5 cm came out as 5.3 m."""
+    """A vertical move of 5 cm was reported as 5.3 m."""
     found, _ = of_one_picture("weak", 2)
     assert found.refitted is not None and "mm" not in found.refitted.explanation
     assert "(the distance is unknown, because phi is)" in found.refitted.explanation
 
 
 def test_other_lenses_count_once() -> None:
-    """They were in the prior and beside it, each with all that the new observations had added to the chosen one."""
+    """They counted in the prior and beside it, each with all the information of the new observations."""
     _, errors = of_one_picture("tilted", 3)
     for height_m, most_mm in ((0.0, 1.1), (0.15, 2.0)):
         _, sd, _ = errors[height_m]
@@ -543,7 +543,7 @@ def test_other_lenses_count_once() -> None:
 
 @pytest.mark.parametrize("tilt_deg", partly([0.0, 8.0], [8.0]))
 def test_a_camera_that_was_not_seen_is_known_as_before(tilt_deg: float) -> None:
-    """By one normal distribution in place of a valley the floor that it sees was known to 17 mm, which had been .1."""
+    """With one normal distribution for a valley, the floor that it sees was known to 17 mm instead of 0.1 mm."""
     scene = scene_of(SetUp(2, tilt_deg, AUTO, False, False), np.random.default_rng(5))
     before = calibrate(simulate(scene, NOISE, 1).observations)
     moved, still = scene.stations
@@ -561,7 +561,7 @@ def test_a_camera_that_was_not_seen_is_known_as_before(tilt_deg: float) -> None:
 
 
 def test_a_refit_knows_the_lenses_that_predicted_as_well() -> None:
-    """From where each sees the new observations: beyond the outermost ones they show what they show."""
+    """Each lens has its own pose for the new observations; beyond these they differ as the lenses do."""
     found, _ = of_one_picture("weak", 3)
     posterior = found.uncertainty.posterior
     near, *others = posterior.lenses
@@ -571,4 +571,4 @@ def test_a_refit_knows_the_lenses_that_predicted_as_well() -> None:
     for other in others:
         middle = np.array([[640.0, 480.0], [900.0, 300.0]])
         gap = other.camera_at("overhead").locate(middle) - near.camera_at("overhead").locate(middle)
-        assert np.max(np.abs(gap)) < 5e-3  # 1 mm measured; metres were its pose the one before the move
+        assert np.max(np.abs(gap)) < 5e-3  # 1 mm measured; metres with the pose from before the move

@@ -1,4 +1,4 @@
-"""The script that a lab copies, and that a refit killed at any moment leaves a whole calibration."""
+"""The script for copying, and a test that a refit killed at any moment leaves a complete calibration."""
 
 import json
 import os
@@ -24,7 +24,9 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 
 @pytest.fixture
 def place(files_of_a_move: Path, tmp_path: Path) -> Path:
-    """A folder with a calibration, observations from before and after a move, such that nothing explains, and none."""
+    """A folder with a calibration, observations from before and after a move, unexplainable ones,
+    and a damaged file.
+    """
     shutil.copytree(files_of_a_move, tmp_path, dirs_exist_ok=True)
     (tmp_path / "old.json").rename(tmp_path / "calibration.json")
     (tmp_path / "broken.json").write_text('{"format": "ceres-cal/obs')
@@ -52,7 +54,7 @@ def test_one_file_after_the_other(place: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_it_asks_twice(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One file changes nothing; what is to be rare in all checks is rare in two of them, one after the other."""
+    """One file changes nothing; the false alarm rate over all checks is that of two in a row."""
     calibration, log = place / "calibration.json", place / "events.jsonl"
     before = calibration.read_bytes()
     code, events = run(capsys, calibration, place / "after.json", place / "same.json", place / "after.json")
@@ -85,7 +87,7 @@ def test_a_folder_is_watched(place: Path) -> None:
     try:
         time.sleep(0.5)
         (incoming / "new.json").write_bytes((place / "after.json").read_bytes())
-        deadline = time.monotonic() + 120.0  # other tests are at work, too
+        deadline = time.monotonic() + 120.0  # other tests run at the same time
         while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") >= 2):
             (incoming / "new.json").touch()  # it may have come before the watch began
             time.sleep(0.3)
@@ -98,7 +100,7 @@ def test_a_folder_is_watched(place: Path) -> None:
 
 @pytest.mark.thorough
 def test_a_week_in_fast_motion(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """A move, a folder that is away and a full disk, each with files that are damaged beside good ones."""
+    """A move, a missing folder and a full disk, each with damaged files among good ones."""
     for name, value in (("HEAP", 10), ("KINDS", 3), ("MOVE_EVERY", 30), ("AWAY_EVERY", 20), ("FULL_EVERY", 40)):
         monkeypatch.setattr(week, name, value)
     assert week.main(["--runs", "60", "--json"]) == 0
@@ -108,7 +110,7 @@ def test_a_week_in_fast_motion(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
 @pytest.mark.thorough
 def test_a_killed_refit_leaves_a_whole_calibration(place: Path) -> None:
-    """Killed at random moments of its life, and, in a loop of nothing but writing, at random moments of that."""
+    """Killed at random moments, and, in a loop that only writes, at random moments of writing."""
     calibration, rng = place / "calibration.json", random.Random(0)
     old = calibration.read_bytes()
     refit = ["-c", "import sys; from ceres_cal.cli import main; sys.exit(main(sys.argv[1:]))", "refit"]

@@ -1,4 +1,4 @@
-"""What is typed wrong is said before a photograph or a video is read, and before anything is solved."""
+"""Wrong arguments are reported before a photograph or a video is read, and before anything is solved."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ WRONG = {
         ("BARE", "does not say how well it is known"),
     ],
 }
-"""Of each command that takes long, what is wrong of every option that has a value of its own."""
+"""For each command that takes long: a wrong value of every option with its own syntax."""
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +176,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture
 def nothing_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A photograph or a video that is read, and a solve, are failures that nobody takes for wrong usage."""
+    """Reading a photograph or a video, and solving, fail with errors that are not wrong usage."""
 
     def fail(*_: Any, **__: Any) -> Any:
         raise AssertionError("work was done before the mistake was said")

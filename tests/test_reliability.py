@@ -1,4 +1,4 @@
-"""Hostile files, faults, forks: each ends in one clear line, or in the right answer (docs/reliability.md)."""
+"""Malicious files, faults, forks: each ends in one clear line, or in the right answer (docs/reliability.md)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def calibration(observations: Observations) -> Calibration:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one good file for each reader, and what commands take besides: a worker's own copy."""
+    """A folder with one good file for each reader, and other inputs of commands: one for each worker."""
 
     def made() -> Path:
         folder = tmp_path_factory.mktemp("made") / "good"
@@ -79,14 +79,14 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def program(*arguments: object, **settings: Any) -> subprocess.CompletedProcess[str]:
-    """A command as a program of its own."""
+    """A command as its own process."""
     words = [*PROGRAM, *map(str, arguments)]
     environment = ENVIRONMENT | settings.pop("env", {})
     return subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment, **settings)
 
 
 def refused(read: Callable[[Path], object], path: Path, words: str, most_s: float = 10.0) -> None:
-    """One line that names the file, soon."""
+    """One line that names the file, within a short time."""
     begin = time.process_time()
     with pytest.raises(InputError) as raised:
         read(path)
@@ -109,7 +109,7 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
 
 
 def test_a_pipe_among_columns_is_refused(tmp_path: Path, good: Path) -> None:
-    """NumPy would wait for its writer for ever; and rows in Fortran order do not lie one by one."""
+    """NumPy would wait for its writer for ever; and rows in Fortran order are not contiguous."""
     place = tmp_path / "a.columns"
     shutil.copytree(good / "observations.columns", place)
     column = place / "points_pixels.npy"
@@ -124,7 +124,7 @@ def test_a_pipe_among_columns_is_refused(tmp_path: Path, good: Path) -> None:
 
 
 def test_columns_in_fortran_order_are_the_same_observations(tmp_path: Path, good: Path) -> None:
-    """The compiled kernels take rows that lie one by one; numba would compile others for half a minute."""
+    """The compiled kernels need contiguous rows."""
     with np.load(good / "observations.npz") as archive:
         arrays: dict[str, Any] = {name: np.asfortranarray(archive[name]) for name in archive.files}
     np.savez(tmp_path / "fortran.npz", **arrays)
@@ -163,7 +163,7 @@ def repacked(archive: Path, place: Path, columns: dict[str, bytes], twice: str =
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_an_archive_that_unpacks_to_gigabytes(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unknown columns are not read, known ones within the limit, and not more than the archive has bytes for."""
+    """Unknown columns are not read, known ones only within the limit, and not more than the archive contains."""
     archive, path = good / "observations.npz", tmp_path / "bomb.npz"
     zeros = bytes(200_000_000)
     refused(Observations.load, repacked(archive, path, {"more.npy": zeros}), "unknown column 'more'")
@@ -277,7 +277,7 @@ def test_calibrations_that_contradict_themselves(
 
 
 def test_what_is_given_twice(tmp_path: Path, good: Path) -> None:
-    """Also under another spelling of its name; a parser would quietly take the last one."""
+    """Also with another spelling of its name; a parser would silently use the last one."""
     for name, read in (("calibration.json", Calibration.load), ("observations.json", Observations.load)):
         for key in ('"version"', '"versio\\u006e"'):
             path = tmp_path / name
@@ -347,7 +347,7 @@ def test_odd_input_before_every_command(good: Path) -> None:
 
 
 def test_what_the_fuzzer_counts_as_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It sees a raw error, a warning, a file that is cut short, two lines of error and an unknown exit code."""
+    """It detects an exception, a warning, a truncated file, two lines of error and an unknown exit code."""
 
     def half(_: list[str]) -> int:
         (tmp_path / "half.json").write_text('{"a": ')
@@ -396,16 +396,16 @@ def test_pixels_far_off_and_another_origin(observations: Observations) -> None:
 def test_a_field_in_another_unit(many: float, said: str) -> None:
     with pytest.raises(InputError, match=said):
         ssl_field("B", field_length_m=9.0 * many, field_width_m=6.0 * many)
-    assert ssl_field("B", field_length_m=9.0 / 0.3048)  # one alone is a long field
+    assert ssl_field("B", field_length_m=9.0 / 0.3048)  # one alone is possible for a long field
 
 
 @pytest.mark.parametrize("scale", [0.001, 1000.0])
 @pytest.mark.parametrize("phi", [100.0, 100_000.0])
 def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> None:
-    """9 mm and 9 km wide: the truth within 1.7 sd; pytest turns warnings of NumPy into errors."""
+    """9 mm and 9 km wide: errors below 1.7 sd; pytest turns warnings of NumPy into errors."""
     field = ssl_field("B")
     points = {name: (scale * x, scale * y, 0.0) for name, (x, y, _) in field.points.items()}
-    centre = (0.75 * phi - 0.5, 0.55 * phi - 0.5)  # where it is held
+    centre = (0.75 * phi - 0.5, 0.55 * phi - 0.5)  # where it is fixed
     camera = Camera((round(1.5 * phi), round(1.1 * phi)), phi, centre, Radial((0.0, 0.0)))
     pose = overhead_pose(-0.5 * scale, -1.2 * scale, 6.0 * scale, -14.0, -11.5, 4.0)
     scene = field_scene(custom(points), {"c": camera}, {"c": Station("c", pose)})
@@ -418,7 +418,7 @@ def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> N
 
 
 def _nearly_singular(observations: Observations) -> Iterator[Observations]:
-    """Few, equal, collinear, exact and worthless observations."""
+    """Few, equal, collinear, exact and useless observations."""
     points, curves = observations.points, observations.curves
     none = np.zeros(len(curves), bool)
     for count in range(1, 9):
@@ -465,7 +465,7 @@ def _phi(path: str) -> bytes:
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_children_after_a_calibration_in_the_parent(method: str, calibration: Calibration) -> None:
-    """The pool of threads is the parent's alone; and all say the same to the last bit."""
+    """The thread pool belongs to the parent only; and all results are equal to the last bit."""
     mine = _phi(str(SAMPLE))
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context(method)) as pool:
         first, second = (answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(2)])
@@ -479,7 +479,7 @@ def test_threads_that_calibrate_at_once(calibration: Calibration) -> None:
 
 @pytest.mark.thorough
 def test_sigterm_is_as_clean_as_ctrl_c(tmp_path: Path) -> None:
-    """No stack of glog's, also in the middle of native work."""
+    """No stack trace of glog, also during native work."""
     image, rng = tmp_path / "noise.jpg", np.random.default_rng(0)
     cv2.imwrite(str(image), cv2.resize(rng.integers(0, 255, (1200, 1600), dtype=np.uint8), (6400, 4800)))
     board = ["detect", "board", str(image), "--columns", "9", "--rows", "6", "--square", "0.02", "-o"]
@@ -498,7 +498,7 @@ def test_sigterm_is_as_clean_as_ctrl_c(tmp_path: Path) -> None:
 
 
 def test_sigterm_while_a_library_is_loaded(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Native modules make an ImportError of whatever comes while they begin."""
+    """Native modules turn any exception during their initialisation into an ImportError."""
 
     def load(arguments: list[str]) -> None:
         raise ImportError("initialization failed") from terminal.Termination()
@@ -547,7 +547,7 @@ def test_what_killed_runs_left_is_removed(tmp_path: Path) -> None:
 
 
 def test_names_in_other_encodings(tmp_path: Path) -> None:
-    """Nothing is lost because a name, or a terminal, is not of UTF-8."""
+    """Nothing is lost if a name or a terminal does not use UTF-8."""
     shot = next((ROOT / "data" / "ssl_field_moved" / "photographs").iterdir())
     odd = tmp_path / os.fsdecode(b"caf\xe9.jpg")
     shutil.copy(shot, odd)
@@ -560,7 +560,7 @@ def test_names_in_other_encodings(tmp_path: Path) -> None:
 
 
 def test_a_name_that_is_no_utf8_stops_no_batch(tmp_path: Path, good: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The others are calibrated, and it has its line, its file and its place on the page."""
+    """The others are calibrated, and it has its line, its file and its entry on the page."""
     rooms = tmp_path / os.fsdecode(b"rooms\xe9")
     rooms.mkdir()
     for name in (b"caf\xe9.json", b"b.json"):
@@ -607,7 +607,7 @@ def test_real_images_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_what_appears_in_a_folder(tmp_path: Path) -> None:
-    """Regular files that have stopped growing, once each; junk holds nothing up; the folder may go and come back."""
+    """Regular files that have stopped growing, once each; other files cause no delay; the folder may disappear."""
     place = tmp_path / "incoming"
     place.mkdir()
     (place / "before.json").touch()
@@ -642,7 +642,9 @@ def test_a_journal_loses_nothing(tmp_path: Path) -> None:
 
 
 def test_a_watch_that_nobody_reads(good: Path, tmp_path: Path) -> None:
-    """Its folder goes, its output is closed, junk and a pipe lie in wait; a good file is answered, SIGTERM ends it."""
+    """Its folder is removed, its output is closed, there are junk and a pipe; a good file is
+    answered, SIGTERM ends it.
+    """
     incoming, calibration = tmp_path / "incoming", tmp_path / "calibration.json"
     incoming.mkdir()
     shutil.copy(good / "calibration.json", calibration)

@@ -1,4 +1,4 @@
-"""The report: a page that needs nothing, says the verdict first, and looks right in a real browser."""
+"""The report: a self-contained page with the verdict first, which is displayed correctly in a real browser."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def sample_page() -> str:
 
 
 def tilted(degrees: float) -> tuple[Calibration, Observations]:
-    """A field from 4 m by a camera that leans by so much."""
+    """A field from 5.2 m by a camera tilted by this angle."""
     stations = {"overhead": Station("overhead", overhead_pose(0.2, 0.1, 5.2, tilt_x_deg=degrees))}
     scene = field_scene(ssl_field("B"), {"overhead": camera("radial-2-3")}, stations, points=(), spacing_m=0.25)
     observations = simulate(scene, Disturbance(0.3, 0.3), seed=2).observations
@@ -245,7 +245,7 @@ def test_no_accuracy_is_stated_where_the_noise_is_three_times_the_stated_one() -
 
 @pytest.mark.parametrize("noise_px, ratio", [(0.5, 0.0), (2.5, 5.0)])
 def test_noise_of_curves_as_paint_wanders_is_no_doubt(noise_px: float, ratio: float) -> None:
-    """2.5 mm, and 13."""
+    """2.5 mm, and 13 mm."""
     station = Station("c", overhead_pose(0.0, 0.0, 4.2, 12.0, 8.0, 0.0))
     scene = field_scene(ssl_field("B"), {"c": camera("brown")}, {"s": station}, spacing_m=0.25)
     observations = simulate(scene, Disturbance(0.1, noise_px), 1).observations
@@ -273,7 +273,7 @@ def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
 
 
 def test_a_fault_that_moves_places_by_little_is_counted() -> None:
-    """A fault that moves places by less than their standard deviations widens what is promised."""
+    """A fault with an effect smaller than the standard deviations increases the promised errors."""
     calibration, observations = sample()
     sound = quality_of(calibration, observations)
     assert sound.diagnosis is not None and sound.uncertainty is not None
@@ -473,7 +473,7 @@ def test_what_a_lens_shows_is_as_uncertain_as_lenses_scatter() -> None:
     rays, every = seen.rays(pixels), []
     for step in steps:
         other = camera_moved(seen, [key.quantity for key in keys], step)
-        u, _, vt = np.linalg.svd(other.rays(pixels).T @ rays)  # Kabsch: the turn that brings them together
+        u, _, vt = np.linalg.svd(other.rays(pixels).T @ rays)  # Kabsch: the rotation between them
         every.append(np.linalg.norm(other.project(rays @ (u @ vt).T) - pixels, axis=1))
     scattered = np.quantile(every, 0.95, axis=0).reshape(known.radius_95_px.shape)
     assert np.median(known.radius_95_px / scattered) == pytest.approx(1.0, abs=0.1)
@@ -517,7 +517,7 @@ def test_the_plotting_library_comes_in_when_a_picture_is_drawn() -> None:
 
 # ---- a real browser -------------------------------------------------------------------------------------------------
 
-# Letters that end outside their place, elements that stick out of the window, tables wider than their box.
+# Text that is cut off, elements outside the window, and tables wider than their box.
 _CUT_OFF = """
 (() => {
   document.querySelectorAll('details').forEach(d => d.open = true);
@@ -543,7 +543,7 @@ _CUT_OFF = """
 """
 
 
-# Letters with less contrast than 4.5 : 1 (WCAG AA) to what lies behind them; pictures have the page's own ground.
+# Text with a contrast below 4.5 : 1 (WCAG AA) to its background; pictures have the page's own background.
 _PALE = """
 (() => {
   const rgb = text => (text.match(/[\\d.]+/g) || []).map(Number), found = new Set();

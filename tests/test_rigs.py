@@ -1,4 +1,4 @@
-"""Rigs from `detect board` on: which frames are one moment, labels that agree, baseline and angle."""
+"""Rigs from `detect board` on: frames of one moment, consistent labels, baseline and angle."""
 
 import json
 import shutil
@@ -47,7 +47,7 @@ def _rig(board: Target, count: int = 11, seed: int = 3) -> Observations:
 
 
 def _turned(observations: Observations, station: str, frames: tuple[str, ...]) -> Observations:
-    """The points of a board in the frames of one station as if it had been turned: the last first."""
+    """The points of a board in some frames of one station with labels rotated by 180 degrees: the last first."""
     points = observations.points
     last = len(observations.targets["board"].points) - 1
     own = np.array([view.station == station and view.frame in frames for view in observations.views])
@@ -159,7 +159,7 @@ def test_baseline_and_angle_with_their_sd() -> None:
 
 
 def test_cameras_without_a_common_moment_have_no_baseline() -> None:
-    """Frames named by time stamps that differ: the baseline was 0 ± 0 mm, and nothing was said."""
+    """Frames named by different time stamps: the baseline was 0 ± 0 mm, without a message."""
     rig = _rig(checkerboard(9, 6, 0.1))
     late = {view.station for view in rig.views[-1:]}
 
@@ -177,7 +177,7 @@ def test_cameras_without_a_common_moment_have_no_baseline() -> None:
 
 
 def test_few_boards_before_a_pair_are_as_wide_as_they_are_off() -> None:
-    """A weak direction was held with the boards that both see in it, of which no prior speaks: sd of 3 to 490 mm."""
+    """A weak direction was fixed together with the boards that both see, without a prior: sd of 3 to 490 mm."""
     off = []
     for seed in range(4):
         (pair,) = calibrate(_rig(checkerboard(5, 4, 0.1), 3, seed)).uncertainty.rig
@@ -187,7 +187,7 @@ def test_few_boards_before_a_pair_are_as_wide_as_they_are_off() -> None:
 
 
 def test_opencv_left_right(real_data: Path) -> None:
-    """On its own corners cv2.stereoCalibrate, everything free at once, ends at 83.1815 mm and 0.2150 px."""
+    """With its own corners, cv2.stereoCalibrate ends at 83.1815 mm and 0.2150 px with everything free."""
     board, sides = checkerboard(9, 6, 0.025), []
     for side in ("left", "right"):
         corners = {p.stem: _opencv_corners(p) for p in sorted((real_data / "opencv_left_right").glob(f"{side}*.jpg"))}
@@ -204,8 +204,8 @@ def test_opencv_left_right(real_data: Path) -> None:
 @pytest.mark.usefixtures("words_alone")
 @pytest.mark.thorough
 def test_opencv_left_right_by_defaults_is_usable(real_data: Path, say: Say, tmp_path: Path) -> None:
-    """What may be a thin prism of 4 ± 2 px, beside a spline that leaves 0.006 px of it, moved the principal point by 42
-    standard deviations, "cannot be trusted"; heights above the other camera were "known to 9.6 % only".
+    """A possible thin prism of 4 ± 2 px, beside a spline that leaves 0.006 px of it, moved the principal point by 42
+    standard deviations: "cannot be trusted". Heights above the other camera were "known to 9.6 % only".
     """
     for side in ("left", "right"):
         (tmp_path / "rig" / side).mkdir(parents=True)
@@ -226,7 +226,7 @@ def _opencv_corners(path: Path) -> np.ndarray:
 
 
 def test_a_camera_of_which_nothing_is_left_gets_the_same_kind_of_lens() -> None:
-    """Where all of its observations had been taken out, it kept the lens before: "unexpected KeyError: 'a2'"."""
+    """If all of its observations were rejected, it kept its previous lens: "unexpected KeyError: 'a2'"."""
     sights = gather_sights(_rig(checkerboard(5, 4, 0.1), 2).of_station("left"))
     there = Estimate({"left": _LEFT, "right": _LEFT}, _STATIONS, {}, EXACT)
     seen = seen_through(there, Options(lens="radial"), profiles_of(there, sights))
@@ -234,7 +234,7 @@ def test_a_camera_of_which_nothing_is_left_gets_the_same_kind_of_lens() -> None:
 
 
 def test_exchanged_frames_take_out_no_others() -> None:
-    """As displaced views they spoke for a principal point that moves by 60 px, and half of all was taken out."""
+    """As displaced views they indicated a principal point that moves by 60 px, and half of all rows were rejected."""
     seen = _rig(checkerboard(9, 6, 0.1))
     exchanged = _in_other_frames(seen, {"board_05": "board_08", "board_08": "board_05"})
     calibration = calibrate(exchanged)
@@ -246,7 +246,7 @@ def test_exchanged_frames_take_out_no_others() -> None:
 
 
 def test_turned_labels_are_no_exchanged_frames() -> None:
-    """A board that is labelled turned suits another frame better, by chance."""
+    """A board with rotated labels may fit another frame better by chance."""
     seen = _turned(_rig(checkerboard(4, 6, 0.1), 8), "right", ("board_02", "board_05"))
     otherwise = shown_otherwise(seen)
     assert set(otherwise) == {("right", "board_02"), ("right", "board_05")}
@@ -254,7 +254,7 @@ def test_turned_labels_are_no_exchanged_frames() -> None:
 
 
 def test_a_camera_one_frame_late_is_named() -> None:
-    """It missed half of its observations: "check labels, target dimensions and the lens"."""
+    """It lost half of its observations, with the message "check labels, target dimensions and the lens"."""
     seen = _rig(checkerboard(9, 6, 0.1), 8)
     names = list(dict.fromkeys(view.frame for view in seen.views))
     late = _in_other_frames(seen, dict(zip(names, names[1:] + names[:1], strict=True)))
@@ -263,7 +263,9 @@ def test_a_camera_one_frame_late_is_named() -> None:
 
 
 def test_a_board_that_moves_between_two_shutters_is_named() -> None:
-    """By 3 mm: one of ten such rigs was usable with limits, and numbers were hundreds of standard deviations off."""
+    """By 3 mm: one of ten such rigs was usable with limits, and numbers had errors of hundreds of
+    standard deviations.
+    """
     scene = board_scene(
         checkerboard(9, 6, 0.05), {"left": _LEFT, "right": _LEFT}, _STATIONS, 8, 3, BoardRanges((0.6, 1.2))
     )
@@ -281,7 +283,7 @@ def test_a_board_that_moves_between_two_shutters_is_named() -> None:
 
 
 def test_a_lost_board_that_both_cameras_see_is_posed_again() -> None:
-    """Lenses had been compared by other boards: it stayed where the start put it, and both views were taken out."""
+    """Lenses were compared without it, so that it kept its initial pose, and both of its views were rejected."""
     seen = _rig(checkerboard(9, 6, 0.1), 5)
     calibration = calibrate(seen, _BROWN)
     name, pose = next(iter(calibration.placements.items()))
@@ -291,7 +293,7 @@ def test_a_lost_board_that_both_cameras_see_is_posed_again() -> None:
 
 
 def _in_other_frames(observations: Observations, frames: Mapping[str, str]) -> Observations:
-    """What the right camera shows in some frames under the names of others."""
+    """Frames of the right camera with the names of others."""
     views = [
         replace(view, frame=frames[view.frame], placement=frames[view.frame])
         if view.station == "right" and view.frame in frames
@@ -327,7 +329,7 @@ def test_join_as_typed(say: Say, tmp_path: Path) -> None:
 def test_run_makes_the_labels_of_a_camera_upside_down_agree(
     say: Say, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A board of 5 x 3 corners: without it the second camera missed half of its observations by more than 24 px."""
+    """A board of 5 x 3 corners: without it the second camera lost half of its observations by more than 24 px."""
 
     def calibrated(*given: object) -> None:
         raise InputError(f"calibrate {given[-1]}")

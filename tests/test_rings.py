@@ -48,7 +48,7 @@ def before_sheet() -> Camera:
 
 
 def errors_px(observations: Observations) -> Array:
-    """How far each edge lies outside its ring, px."""
+    """Distance of each edge outside its ring, px."""
     posed, edges = before_sheet(), observations.curves
     place = posed.locate(edges.pixels)
     radius = np.hypot(*place.T)

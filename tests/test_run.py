@@ -1,4 +1,4 @@
-"""`ceres-cal run`: from photographs or a video to a calibration that may be trusted, or one that says why not."""
+"""`ceres-cal run`: from photographs or a video to a calibration that can be trusted, or one that states why not."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ FIELD = ("--target", "ssl-b", "--facing", "LeftGoalLine=top")
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a board, in one folder."""
+    """Photographs of a board, in one folder."""
     folder = tmp_path_factory.mktemp("photographs")
     for name in ("board_01", "board_03", "board_05"):
         shutil.copy(SAMPLE / "photographs" / f"{name}.jpg", folder)
@@ -38,7 +38,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_folder_to_a_camera_and_its_export(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of boards; the README is tested, and has one of a field besides."""
+    """With boards; the test of the README has also a field."""
     out = tmp_path / "camera"
     ask = ["run", str(photographs), "--lens", "radial", "--board", "9x6x100mm", "--to", "opencv", "-o", str(out)]
     assert main(ask) == 0
@@ -54,7 +54,7 @@ def test_a_folder_to_a_camera_and_its_export(
     (camera,) = Calibration.load(out / "calibration.json").cameras.values()
     truth = json.loads((SAMPLE / "truth.json").read_text())
     assert camera.phi == pytest.approx(truth["cameras"]["overhead"]["phi"], abs=0.5)
-    # Each step is a command that can be typed.
+    # Each step is printed as a command that can be typed.
     commands = [line.partition("ceres-cal ")[2].split() for line in said.splitlines() if line.startswith("step ")]
     assert [words[0] for words in commands] == ["detect", "calibrate", "export"]
     COMMANDS["calibrate"].parse(commands[1][1:])
@@ -92,7 +92,7 @@ def test_boards_alone_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ask = ("--board", "9x6x100", "--frames", "6", "--to", "vision-processor", "-o", str(tmp_path / "out"), "--json")
     code = main(["run", str(video), *ask])
     data = json.loads(capsys.readouterr().out)
-    assert code == 1 and data["steps"][2]["answer"] == {}  # that message needs a field; the rest is made
+    assert code == 1 and data["steps"][2]["answer"] == {}  # that message needs a field; all else is made
     assert data["images"] == 6 and len(data["steps"]) == 3
     assert data["steps"][1]["answer"]["calibration"]["cameras"]["camera"]["phi"] == pytest.approx(868.0, abs=6.0)
 
@@ -139,8 +139,8 @@ def test_a_plan_names_the_first_of_many_photographs() -> None:
 def test_a_folder_of_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One calibration of all of them, called like their folder or video, and a report with a picture of each: a field's
-    video ended without a report, and two in a folder were "no images".
+    """One calibration of all of them, with the names of their folders or videos, and a report with a picture of each. A
+    video of a field ended without a report, and two in a folder were "no images".
     """
     cameras, out = tmp_path / "cameras", tmp_path / "out"
     (cameras / "left").mkdir(parents=True)
@@ -154,7 +154,7 @@ def test_a_folder_of_cameras(
     assert main(asked) == 2
     assert "say which, such as --facing left.LeftGoalLine=" in capsys.readouterr().err
     sides = ("--facing", "left.LeftGoalLine=top", "--facing", "right.LeftGoalLine=bottom")
-    advised: list[str] = []  # of one of them, where they are to be used with care
+    advised: list[str] = []  # of one of them, where the verdict has limits
 
     def cautiously(*given: Any) -> _Step:
         step = _calibrated(*given)
@@ -185,13 +185,13 @@ def test_a_folder_of_cameras(
     assert "two cameras would be called 'left', like their folder or video" in capsys.readouterr().err
     assert each_camera([str(cameras / "right.avi")]) == []
     both = [str(cameras / "left"), str(cameras / "right.avi")]
-    assert [str(one) for one in each_camera(both)] == both  # they were taken for one camera's
+    assert [str(one) for one in each_camera(both)] == both  # they were taken for the files of one camera
     assert each_camera([*both, PHOTOGRAPH]) == []
 
 
 @pytest.mark.usefixtures("words_alone")
 def test_two_folders_of_one_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Boards in one and the field in another tie no cameras, and are one's that is named."""
+    """Boards in one folder and the field in another connect no cameras, but belong to one camera if it is named."""
     asked = ["run", "--target", "ssl-b", "--facing", "LeftGoalLine=top", "--board", "9x6x100mm", "--lens", "radial"]
     for name, folder in (("0001", "field"), ("board_01", "boards"), ("board_02", "boards")):
         (tmp_path / folder).mkdir(exist_ok=True)
@@ -213,7 +213,7 @@ def test_no_photograph_at_all(tmp_path: Path) -> None:
 def test_a_folder_that_holds_nothing_but_a_folder_for_each_camera(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The answer looked for videos in the folder that was given, where there was nothing, and was not printed."""
+    """The answer looked for videos in the given folder, where there were none, and was not printed."""
     for name, numbers in (("left", "1234"), ("right", "5678")):
         (tmp_path / "cameras" / name).mkdir(parents=True)
         for number in numbers:

@@ -65,13 +65,13 @@ def test_wrong_usage(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_figures_alone_for_other_programs(capsys: pytest.CaptureFixture[str]) -> None:
-    """--json without a file prints them in place of the table."""
+    """--json without a file prints the figures instead of the table."""
     assert say("--case", "even", "--case", "odd", "--json") == 0
     assert [row["value"] for row in json.loads(capsys.readouterr().out)] == [14.0, 7, 2, 2]
 
 
 def test_every_script_is_found_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
-    """Names are not given twice, each has a line in the list, and what documents say to run is there."""
+    """Names are unique, each has a line in the list, and scripts that documents name exist."""
     assert front.main([]) == 0
     listed = capsys.readouterr().out
     every = [path.stem for path in front.HERE.glob("*/*.py") if "main = script(" in path.read_text(encoding="utf-8")]

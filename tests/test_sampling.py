@@ -1,4 +1,4 @@
-"""What pixels draw thin lines aside by, told by the picture itself."""
+"""Displacements of thin lines by the pixel grid, estimated from the picture itself."""
 
 import numpy as np
 import pytest
@@ -19,8 +19,8 @@ from ceres_cal.simulate import Station
 @pytest.mark.parametrize("jpeg_quality", [0, 90])
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 90.0])
 def test_thin_lines_are_not_drawn_aside(degrees: float, jpeg_quality: int) -> None:
-    """Two thirds of a pixel wide, sharp, through a colour sensor: 0.11 px of error that hardly changes along a line; in
-    a JPEG file, which keeps the colours of two by two pixels, all lines lay 0.02 px to one side.
+    """Two thirds of a pixel wide, sharp, through a colour sensor: errors of 0.11 px that hardly change along a line; in
+    a JPEG file, which stores one colour for two by two pixels, all lines were 0.02 px to one side.
     """
     angles = np.deg2rad(np.linspace(0.3, 3.0, 12))
     lines = {}

@@ -1,4 +1,4 @@
-"""The precision of board corners, as their own pictures tell it."""
+"""The precision of board corners, estimated from their own pictures."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ WIDE = Camera((1280, 960), 700.0, (640.0, 480.0), Brown((-0.25, 0.06, 0.0, 0.0, 
 
 
 def grids(columns: int, rows: int, noise_px: float, bow_m: float = 0.0) -> list[Array]:
-    """Six boards before a wide lens, bent by a bow across."""
+    """Six boards in front of a wide lens, with a bow."""
     board, rng = checkerboard(columns, rows, 0.05), np.random.default_rng(columns)
     points = board.point_array.copy()
     points[:, 2] += bow_m * np.linspace(-1.0, 1.0, columns)[np.lexsort((points[:, 0], points[:, 1])) % columns] ** 2

@@ -1,4 +1,4 @@
-"""Files of our own: the shipped schemas are the reader's, and docs/files.md names every field."""
+"""Our own files: the package's schemas are those of the reader, and docs/files.md names every field."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_every_field_is_documented(name: str) -> None:
 
 
 def properties(schema: dict[str, Any], data: dict[str, Any]) -> None:
-    """What a validator asks of the top of a file: all that is required, nothing unknown, the stated words."""
+    """What a validator requires at the top of a file: all required fields, none unknown, the stated words."""
     top = schema["$defs"][schema["$ref"].rpartition("/")[2]]
     assert not set(top["required"]) - set(data) and not set(data) - set(top["properties"])
     assert data["units"] in top["properties"]["units"]["enum"] and top["additionalProperties"] is False

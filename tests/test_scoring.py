@@ -1,4 +1,4 @@
-"""New boards and fields under held intrinsics, and intrinsics side by side over the image."""
+"""New boards and fields with fixed intrinsics, and comparison of intrinsics over the image."""
 
 import json
 from dataclasses import replace
@@ -53,7 +53,7 @@ def test_new_boards_are_predicted_to_the_noise(calibration: Calibration) -> None
 
 
 def test_a_board_that_the_lens_cannot_show_is_named(calibration: Calibration) -> None:
-    """It was asked for four points where it had 54."""
+    """The message asked for four points, although there were 54."""
     seen = _boards(2, 3)
     shuffled = np.random.default_rng(0).permutation(seen.points.pixels[:54])
     pixels = np.vstack([shuffled, seen.points.pixels[54:]])
@@ -62,7 +62,7 @@ def test_a_board_that_the_lens_cannot_show_is_named(calibration: Calibration) ->
 
 
 def test_one_camera_of_several_is_scored(calibration: Calibration) -> None:
-    """The rest of a rig has no observations, and no part."""
+    """The other cameras of a rig have no observations, and are ignored."""
     alone = score(calibration, _boards(3, 1))
     cameras = {**calibration.estimate.cameras, "other": next(iter(calibration.estimate.cameras.values()))}
     rig = replace(calibration, estimate=replace(calibration.estimate, cameras=cameras))
@@ -142,7 +142,7 @@ def test_repetitions_are_explained(calibration: Calibration) -> None:
 
 
 def test_a_turn_is_taken_out(calibration: Calibration) -> None:
-    """Another principal point is another direction of all pixels, but hardly another lens."""
+    """Another principal point rotates all rays, but hardly changes the lens."""
     camera = calibration.cameras["camera"]
     shifted = replace(camera, principal_point=(camera.principal_point[0] + 6.0, camera.principal_point[1]))
     other = replace(calibration, estimate=replace(calibration.estimate, cameras={"camera": shifted}))
@@ -188,7 +188,7 @@ def test_score_and_compare_as_typed(say: Say, calibration: Calibration, tmp_path
 @pytest.mark.usefixtures("real_data")
 @pytest.mark.thorough
 def test_ov_plane() -> None:
-    """Its own split: scipy leaves 0.482 px in training, and 0.475 px of the test views with poses alone."""
+    """Its own split: scipy has residuals of 0.482 px in training, and 0.475 px for the test views with free poses."""
     parts = [ov_plane(name) for name in ("train", "test")]
     known = calibrate(
         parts[0],
@@ -207,7 +207,9 @@ def test_ov_plane() -> None:
 
 
 def test_few_clicks_are_noisier_by_chance() -> None:
-    """The same camera, clicked twice as well: of 60 pairs of some ten clicks 11 said "is not good for these"."""
+    """The same camera with clicks twice as accurate: 11 of 60 pairs of about ten clicks said "is
+    not good for these".
+    """
     camera = Camera((1280, 960), 700.0, (640.0, 480.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))
     seen_by = camera.at(Pose.looking((0.3, -0.5, 4.5), rotation_exp((np.pi - 0.2, 0.02, 0.0))))
     field = ssl_field("B")

@@ -1,4 +1,4 @@
-"""The search for where a camera stands: few features before a known camera, what is seen alike, what stays open."""
+"""The search for the place of a camera: few features and a known camera, ambiguous views, and open directions."""
 
 import re
 from collections.abc import Collection
@@ -32,7 +32,7 @@ PLACE = np.array([2.8, 0.5, 4.0])
 
 
 def seen(features: Collection[str], tilt_deg: float = 20.0) -> Observations:
-    """What the camera sees of some lines, arcs and crossings, with 0.3 px of noise on lines and 0.5 px on points."""
+    """Observations of some lines, arcs and crossings, with 0.3 px of noise on lines and 0.5 px on points."""
     station = Station("overhead", overhead_pose(PLACE[0], PLACE[1], PLACE[2], tilt_x_deg=tilt_deg))
     every = simulate(field_scene(ssl_field("B"), {"overhead": CAMERA}, {"hall": station}, spacing_m=0.1)).observations
     field = every.targets["field"]
@@ -48,7 +48,7 @@ def seen(features: Collection[str], tilt_deg: float = 20.0) -> Observations:
 
 
 def off_in_sd(calibration: Calibration) -> float:
-    """How far the camera is from where it stands, over the standard deviation of that."""
+    """Error of the camera's position over its standard deviation."""
     where, posterior = calibration.estimate.stations["hall"].cam_from_world.position, calibration.uncertainty.posterior
     sd = [posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y", "height")]
     return float(np.linalg.norm(where - PLACE) / np.linalg.norm(sd))
@@ -68,7 +68,7 @@ def test_lines_and_an_arc(features: tuple[str, ...]) -> None:
 
 
 def test_seen_alike_after_half_a_turn() -> None:
-    """The halfway line, the centre line and the circle lie on themselves then; a place that is known roughly tells."""
+    """The halfway line, the centre line and the circle are symmetric; a roughly known place resolves the symmetry."""
     middle = seen(("HalfwayLine", "CenterLine", "CenterCircle"), 3.0)
     calibration = calibrate(middle, KNOWN)
     (said,) = calibration.ambiguities
@@ -80,10 +80,10 @@ def test_seen_alike_after_half_a_turn() -> None:
 
 
 def test_a_camera_of_which_it_is_not_known_where_it_stood_did_not_move() -> None:
-    """Calibrated at the other of two places, it was said to have moved by 5.7 m."""
+    """Calibrated at the other one of two places, it was reported to have moved by 5.7 m."""
     calibration = calibrate(seen(("HalfwayLine", "CenterLine", "CenterCircle"), 3.0), KNOWN)
     place = calibration.station("hall").position[0]
-    assert abs(place) == pytest.approx(2.8, abs=0.1)  # at which of the two, rounding decides
+    assert abs(place) == pytest.approx(2.8, abs=0.1)  # rounding decides which of the two
     told = ("TopTouchLine", "BottomTouchLine", "RightGoalLine", "CenterLine", "CenterCircle", "BottomRightCorner")
     other = relabelled(seen(told, 3.0), TURNED) if place > 0.0 else seen(told, 3.0)
     assert other is not None
@@ -92,7 +92,7 @@ def test_a_camera_of_which_it_is_not_known_where_it_stood_did_not_move() -> None
 
 
 def test_seen_alike_from_two_places() -> None:
-    """Three points have up to four poses (Grunert): the other is named and in the deviations; the height tells."""
+    """Three points have up to four poses (Grunert): the other one is named and in the sd; the height resolves it."""
     three = seen(("BottomRightCorner", "CenterMark", "RightCircleCrossing"))
     calibration = calibrate(three, KNOWN)
     (warning,) = calibration.warnings
@@ -108,7 +108,7 @@ def test_seen_alike_from_two_places() -> None:
 
 
 def test_few_boards_tell_nothing_of_a_place_in_the_world() -> None:
-    """Each set of under 300 equations ended with "seen alike from (0.00, 0.00, 0.00) m", and was not trusted for it."""
+    """Every set with fewer than 300 equations was "seen alike from (0.00, 0.00, 0.00) m", and not trusted."""
     few = observed(Board(views=3, columns=6), 0)[1]
     calibration = calibrate(few)
     assert calibration.ambiguities == ()
@@ -127,7 +127,7 @@ def test_too_few_stay_too_few() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [3.0, 20.0])
 def test_a_circle_tells_the_height(tilt_deg: float) -> None:
-    """And nothing of the way round it: the camera is over the floor, and its x and y are not known."""
+    """It does not determine the direction: the camera is above the floor, and its x and y are unknown."""
     calibration = calibrate(seen(("CenterCircle",), tilt_deg), KNOWN)
     position = calibration.estimate.stations["hall"].cam_from_world.position
     assert position[2] == pytest.approx(4.0, abs=0.02)  # 0.004

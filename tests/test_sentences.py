@@ -1,4 +1,4 @@
-"""Every sentence that a user can meet keeps the simple rules of plain English."""
+"""Every sentence for users obeys the simple rules of plain English."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Sights: every observation once, beside what it shows, and with its way back to its row."""
+"""Sights: every observation once, with its feature, and with the number of its row."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.5, hidden_points=0.2)
 
 
 def several() -> Scene:
-    """Two cameras, one of them at two stations; a court whose three sides are seen, and a board at two placements."""
+    """Two cameras, one of them at two stations; a court seen at three sides, and a board at two placements."""
     court = custom(
         {"a": (1.0, 0.5, 0.0), "b": (-1.0, 0.5, 0.3)},
         {
@@ -56,7 +56,7 @@ def seen() -> Observations:
 
 
 def test_sights_are_stations_and_frames() -> None:
-    """All frames of a static camera's court are one sight; each board frame is one of its own."""
+    """All frames of a static camera's court are one sight; each frame of a board is its own sight."""
     sights = gather_sights(seen())
     assert sights.keys == (
         SightKey("left", "left", None),
@@ -70,7 +70,7 @@ def test_sights_are_stations_and_frames() -> None:
 
 
 def assert_true_to(observations: Observations, sights: Sights) -> None:
-    """Each row beside its own pixel, sigma and feature."""
+    """Each row has its own pixel, sigma and feature."""
     for number, key in enumerate(sights.keys):
         sight = sights[number]
         assert sight.keys == (key,) and sight.key == key
@@ -170,7 +170,7 @@ def test_a_view_without_observations_is_no_sight() -> None:
 
 
 def test_nearest_places_are_where_the_ray_passes() -> None:
-    """Against a search along each line and circle for the least distance from the pixel's ray, in space."""
+    """Compared with a search along each line and circle for the least distance from the pixel's ray, in space."""
     observations = seen()
     sights, scene = gather_sights(observations), several()
     for number in (0, 3):
@@ -181,7 +181,7 @@ def test_nearest_places_are_where_the_ray_passes() -> None:
         for place, track, ray in zip(found, sight.track_index, rays, strict=True):
             is_arc = bool(sight.is_arc[track])
             best = nearest_to_ray(sight.tracks[track], is_arc, camera.position, ray, place)
-            # On a line they are the same; on a circle the place is where the ray meets its plane, turned to the middle.
+            # On a line they are equal; on a circle the place is the ray's intersection with its plane, moved radially.
             assert place == pytest.approx(best, abs=0.01 if is_arc else 1e-6)  # 4e-4, 7e-9 measured
 
 
@@ -203,7 +203,7 @@ def test_places_of_no_observation_at_all() -> None:
 
 
 def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
-    """Past the lens's monotone radius, or a ray along the line or the plane: a finite start, never NaN."""
+    """Beyond the lens's monotone radius, or for a ray along the line or the plane: a finite start, never NaN."""
     sight = gather_sights(seen())[0]
     camera = several().camera_at("left")
     folding = replace(camera, lens=camera.lens.with_values((0.0, -1e-6)))
@@ -222,7 +222,7 @@ def test_placements_seen_once() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_observations_beside_a_fold_have_an_equation_or_none(seed: int) -> None:
-    """The search for a foot beside a fold of the lens may not converge. A residual without derivatives made the normal
+    """The search for a foot near a fold of the lens may not converge. A residual without derivatives made the normal
     equations NaN, and one photograph of 200 ended with a traceback.
     """
     rng = np.random.default_rng(seed)

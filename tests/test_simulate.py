@@ -1,4 +1,4 @@
-"""Simulation: every row is where the camera model puts it, and the truth beside it is true."""
+"""Simulation: every row is where the camera model projects it, and its truth is correct."""
 
 import math
 import time
@@ -66,7 +66,7 @@ def camera_before_target(scene: Scene, observations: Observations, view: int) ->
 
 
 def distance_to_curve(curve: Curve, side: int, xy: Array) -> Array:
-    """Distance (N,) m of places in the plane to a curve's line of paint, by elementary geometry."""
+    """Distance (N,) m of places in the plane from the painted line of a curve, by elementary geometry."""
     if isinstance(curve, Arc):
         radius = curve.radius_m - 0.5 * side * curve.width_m
         return np.asarray(np.abs(np.hypot(*(xy - curve.centre[:2]).T) - radius))
@@ -112,7 +112,7 @@ def test_curve_rows_lie_on_their_curves(name: str) -> None:
 
 @each_scene
 def test_shared_scenes_are_whole(name: str) -> None:
-    """The recovery tests rely on it: every station and placement is observed, no lens folds, no view is empty."""
+    """A requirement of other tests: every station and placement is observed, no lens folds, no view is empty."""
     scene = SCENES[name]()
     observations = simulate(scene).observations
     assert set(observations.stations) == set(scene.stations)
@@ -151,7 +151,7 @@ def test_nothing_is_seen_outside_the_image(
     scene = field_scene(ssl_field("B"), {"any": CAMERA}, stations, 3, spacing_m=0.4)
     try:
         simulation = simulate(scene, replace(WORKDAY, outlier_spread_px=300.0), seed=5)
-    except InputError:  # not a thing in view
+    except InputError:  # nothing is in view
         return
     for column in (
         simulation.observations.points,
@@ -284,7 +284,7 @@ def test_wrong_label_of_a_curve_is_its_neighbours() -> None:
 
 
 def test_wrong_label_next_to_an_open_arc() -> None:
-    """The nearest place of a quarter circle is one of its ends, not the circle it would be part of."""
+    """The nearest place of a quarter circle is one of its ends, not a place on the rest of its circle."""
     target = custom(
         curves={
             "line": Segment((-1.0, -0.9, 0.0), (-0.8, -0.9, 0.0)),
@@ -384,7 +384,7 @@ def test_scene_file_round_trip(name: str, tmp_path: Path) -> None:
 
 
 def small_scene() -> dict[str, Any]:
-    """A scene file by hand, as short as can be."""
+    """A minimal scene file."""
     return {
         "format": "ceres-cal/scene",
         "version": 1,
@@ -467,7 +467,7 @@ def test_bad_scenes_get_one_line(broken: Callable[[dict[str, Any]], None], said:
     data = small_scene()
     broken(data)
     path = tmp_path / "scene.json"
-    # Python's infinity has no JSON form: write the number that overflows to it.
+    # JSON has no infinity: write a number that overflows to it.
     path.write_bytes(msgspec.json.encode(data).replace(b"null]", b"1e400]"))
     with pytest.raises(InputError) as caught:
         load_scene(path)
@@ -536,7 +536,7 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 def test_sample_data_come_from_the_script(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every observation and truth; seven of the fourteen photographs are taken anew."""
+    """All observations and truths; seven of the fourteen photographs are rendered again."""
     monkeypatch.setattr(make_data, "PHOTOGRAPHED", make_data.PHOTOGRAPHED[:4])
     assert make_data.main([str(tmp_path)]) == 0
     names = {path.relative_to(ROOT / "data") for path in (ROOT / "data").glob("*/*.json")}
@@ -555,7 +555,7 @@ def test_sample_data_come_from_the_script(
     for path in images:
         ours, theirs = (cv2.imread(str(root / path), cv2.IMREAD_GRAYSCALE) for root in (ROOT / "data", tmp_path))
         assert ours is not None and theirs is not None
-        assert np.mean(cv2.absdiff(ours, theirs)) < 0.5, path  # 0; another OpenCV may draw and compress otherwise
+        assert np.mean(cv2.absdiff(ours, theirs)) < 0.5, path  # 0; another OpenCV may draw and compress differently
 
 
 def test_the_truth_of_the_photographs_is_beside_them() -> None:

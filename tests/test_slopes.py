@@ -1,4 +1,4 @@
-"""How what a camera shows moves with its numbers, against differences of what it shows."""
+"""Derivatives of pixels with respect to the camera's numbers, compared with differences."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_slopes_are_those_of_what_is_shown(lens: str) -> None:
 
 
 def test_what_is_not_shown_moves_nowhere() -> None:
-    """Behind the camera, past the end of its lens, or nowhere at all; no other place is lost with it."""
+    """Behind the camera, beyond the end of its lens, or NaN; other places are not affected."""
     camera = _camera("brown")
     above = camera.position + np.array([0.3, 0.0, 1.0])
     places = np.array([_PLACES[0], above, (np.nan, 0.0, 0.0), _PLACES[1]])

@@ -1,4 +1,4 @@
-"""The lens without a formula: there and back, other lenses in it, how smooth it is, and what is not known of it."""
+"""The lens without a formula: inverse map, other lenses as special cases, smoothness, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from ceres_cal.simulate import Disturbance, Simulation, simulate
 
 @st.composite
 def splines(draw: st.DrawFn) -> Spline:
-    """As barrel-shaped and as crooked as lenses are, and more."""
+    """With usual distortion and deviations, and more."""
     rim = draw(st.floats(300.0, 2000.0))
     blank = Spline.blank(draw(st.sampled_from([(), (2,), (2, 3), (2, 3, 4, 5)])))
     u = np.linspace(0.1, 1.0, 11)
@@ -65,7 +65,7 @@ def test_there_and_back(lens: Spline, phi: float) -> None:
 @settings(deadline=None, max_examples=40)
 @given(splines())
 def test_no_two_rays_have_one_pixel(lens: Spline) -> None:
-    """Up to where it says that it ends: where pixels are next to each other, so are rays, in the same sense."""
+    """Up to its stated limit: neighbouring pixels have neighbouring rays with the same orientation."""
     end = 0.99 * lens.monotone_radius(500.0)
     offsets = disc(end)[24:]
     step = 1e-4 * end
@@ -77,7 +77,7 @@ def test_no_two_rays_have_one_pixel(lens: Spline) -> None:
 @settings(deadline=None, max_examples=20)
 @given(splines())
 def test_its_pieces_are_its_profile(lens: Spline) -> None:
-    """The inverse goes by polynomials, the map along the radius by the compiled lens; straight on from 1."""
+    """The inverse uses polynomials, the map along the radius the compiled lens; linear beyond 1."""
     profile = lens._profile
     places = np.append(0.0, np.linspace(0.03, 0.98 * profile.limit, 40))
     alone = Spline(lens.values[: 1 + COUNT], ()).mapped(np.column_stack([places, np.zeros(41)]))[0, 0]
@@ -101,7 +101,7 @@ def test_powers_are_those_across() -> None:
 
 
 def test_its_knots_end_in_steps() -> None:
-    """So that numbers of two calibrations of one camera, from other views, mean the same."""
+    """So that the numbers of two calibrations of one camera from different views have the same meaning."""
     blank, angles = make_lens("spline", (2, 3)), np.linspace(0.5, 0.8, 61)
     rims = np.array([blank.spanning(angle, 700.0, 1.15, (1280, 960)).values[0] for angle in angles])
     asked = 1.15 * 1400.0 * np.tan(0.5 * angles)
@@ -123,8 +123,8 @@ def solved(lens: str, sigma_px: float) -> Calibration:
 
 
 def off_px(calibration: Calibration, truth: Camera, pixels: Array, shown_px: Array | None = None) -> Array:
-    """(N,) px by which rays of the true camera are shown aside, the camera turned and moved as it may be; of those that
-    are truly seen elsewhere, aside of there.
+    """(N,) px errors of the projected rays of the true camera after the best rotation and motion; `shown_px` are their
+    true pixels where these differ.
     """
     (camera,) = calibration.cameras.values()
     rays, pixels = truth.rays(pixels), pixels if shown_px is None else shown_px
@@ -144,7 +144,7 @@ LENSES = ["radial-2-3-4-5", "brown-rational", "kannala-brandt", "kannala-brandt-
 
 @pytest.mark.parametrize("lens", partly(LENSES, LENSES[:3]))
 def test_every_other_lens_is_one(lens: str) -> None:
-    """Without noise, over the observed image: 0.0003 px measured at most. The longest of each kind."""
+    """Without noise, over the observed image: at most 0.0003 px measured. The longest form of each kind."""
     calibration = solved(lens, 0.0)
     pixels = seen(lens, 0.0).observations.points.pixels
     assert off_px(calibration, scenes.camera(lens), pixels).max() < 2e-3
@@ -152,7 +152,7 @@ def test_every_other_lens_is_one(lens: str) -> None:
 
 
 def test_it_is_as_smooth_as_the_data_say() -> None:
-    """A lens that is centred is not taken for one that is not: what displaces across is known to be little."""
+    """A centred lens is not estimated as decentred: displacements across the radius are known to be small."""
     truth = scenes.camera("kannala-brandt")
     calibration = solved("kannala-brandt", 0.2)
     plain = calibrate(seen("kannala-brandt", 0.2).observations, Options(lens="kannala-brandt"))
@@ -164,14 +164,14 @@ def test_it_is_as_smooth_as_the_data_say() -> None:
 
 
 def aside(pixels: Array) -> Array:
-    """(N, 2) px by which a crooked lens displaces across, which no first powers do."""
+    """(N, 2) px displacements by an irregular lens, which low powers do not describe."""
     x, y = ((pixels - (651.3, 468.9)) / 800.0).T
     return 0.8 * np.column_stack([np.cos(7.0 * x + 3.0 * y), np.sin(8.0 * y - 2.0 * x)])
 
 
 @cache
 def sixty_boards(*, crooked: bool) -> Observations:
-    """Before a fisheye, which is crooked, too."""
+    """In front of a fisheye, which may also be irregular."""
     own = {"camera": scenes.camera("kannala-brandt")}
     scene = board_scene(checkerboard(9, 6, 0.1), own, {"camera": Station("camera", Pose.identity())}, count=60, seed=1)
     plain = simulate(scene, Disturbance(points_sigma_px=0.2), seed=3).observations
@@ -186,7 +186,7 @@ def crooked_with_first_powers() -> Calibration:
 
 @pytest.mark.thorough
 def test_it_becomes_longer_where_views_agree_on_what_it_leaves() -> None:
-    """Unless its powers are stated, or it leaves nothing."""
+    """Unless its powers are stated, or there are no such residuals."""
     straight = calibrate(sixty_boards(crooked=False), Options(lens="spline"))
     grown, held = calibrate(sixty_boards(crooked=True), Options(lens="spline")), crooked_with_first_powers()
     assert straight.options.powers == held.options.powers == (2, 3)
@@ -208,7 +208,7 @@ def test_what_it_does_not_follow_is_in_what_it_states() -> None:
 
 
 def test_where_nothing_was_seen_nothing_is_known() -> None:
-    """Boards in the middle third: the spread of the lens's numbers grows outwards by far."""
+    """Boards in the middle third: the uncertainty of the lens grows strongly outwards."""
     simulation = seen("kannala-brandt", 0.2)
     points = simulation.observations.points
     near = np.linalg.norm(points.pixels - (651.3, 468.9), axis=1) < 260.0
@@ -220,7 +220,7 @@ def test_where_nothing_was_seen_nothing_is_known() -> None:
     assert 10.0 * sd[0] < sd[1] < 0.2 * sd[2] and sd[2] > 3.0 * whole  # 0.06, 3.6, 28 and 8.5 px measured
 
 
-# ---- the rest of the house ------------------------------------------------------------------------------------------
+# ---- other parts of the package -------------------------------------------------------------------------------------
 
 
 def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
@@ -233,7 +233,7 @@ def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
 
 
 def test_how_smooth_it_is_needs_no_options() -> None:
-    """Advice poses problems without any: its command ended in an unknown lens."""
+    """Advice makes problems without options: its command ended with an unknown lens."""
     calibration, observations = solved("brown-rational", 0.0), seen("brown-rational", 0.0).observations
     problem = Problem(gather_sights(observations), make_layout(observations, calibration.options))
     (camera,) = calibration.cameras.values()
@@ -241,7 +241,7 @@ def test_how_smooth_it_is_needs_no_options() -> None:
 
 
 def test_a_refit_of_it_contradicts_nothing() -> None:
-    """One photograph of a field says nothing of most of its numbers: -629 px of phi were said to exclude 868 once."""
+    """One photograph of a field does not determine most of its numbers: -629 px for phi was said to exclude 868."""
     data = Path(__file__).parents[1] / "data"
     known = calibrate(Observations.load(data / "ssl_field" / "observations.json"), Options(lens="spline"))
     moved = refit(known, Observations.load(data / "ssl_field_moved" / "observations.json"))
@@ -251,8 +251,9 @@ def test_a_refit_of_it_contradicts_nothing() -> None:
 
 
 def test_an_unmoved_camera_is_checked_where_some_of_it_is_held() -> None:
-    """As the default choice of a lens holds what displaces across the radius to higher orders: how smooth the lens is
-    counted beside the posterior that has it already, and a check of the same observations said "no" at probability 0.
+    """The default lens choice fixes higher orders of the displacement across the radius. The smoothness prior was
+    counted in addition to the posterior that contains it, and a check of the same observations said "no" with
+    probability 0.
     """
     data = Observations.load(Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json")
     lines = data.part(np.zeros(len(data.points), dtype=bool), data.curves.view == data.curves.view[0])
@@ -264,7 +265,7 @@ def test_an_unmoved_camera_is_checked_where_some_of_it_is_held() -> None:
 @pytest.mark.usefixtures("real_data")
 @pytest.mark.thorough
 def test_a_real_fisheye_to_93_degrees() -> None:
-    """A third of BabelCalib's OV-plane: kannala-brandt leaves 0.212 px of these views, plain least squares."""
+    """A third of BabelCalib's OV-plane: kannala-brandt has residuals of 0.212 px, by plain least squares."""
     plain = Options(lens="spline", powers=(2, 3), free_aspect=True, loss="trivial", reject_sigma=1e9)
     every = ov_plane("train")
     few = every.part(every.points.view % 3 == 0, np.zeros(len(every.curves), dtype=bool))
@@ -272,7 +273,7 @@ def test_a_real_fisheye_to_93_degrees() -> None:
 
 
 def test_what_is_finer_than_its_knots_is_named() -> None:
-    """phi, the slope at the axis, is then 33 px off with 12 stated, though rays are right to a pixel."""
+    """phi, the slope at the axis, then has an error of 33 px with 12 stated, although rays are accurate to a pixel."""
     scene = scenes.MIXES["boards"]("spline")
     (camera,) = scene.cameras.values()
     plain = simulate(scene, Disturbance(points_sigma_px=0.3), 1).observations

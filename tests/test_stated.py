@@ -1,4 +1,4 @@
-"""Nothing is known worse than it was stated, whatever makes wider what the observations say."""
+"""No uncertainty is larger than that of its prior, whatever increases that of the observations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ROUNDING = 1.0 + 1e-6
 
 
 def known(seed: int) -> tuple[Information, Information, np.random.Generator]:
-    """What observations say, of some directions much and of others nothing, and what was stated of three numbers."""
+    """Information of observations, large in some directions and 0 in others, and priors on three numbers."""
     rng = np.random.default_rng(seed)
     units = 10.0 ** rng.uniform(-4.0, 4.0, len(KEYS))
     rows = rng.standard_normal((int(rng.integers(1, 9)), len(KEYS))) * 10.0 ** rng.uniform(-3.0, 3.0) / units
@@ -55,13 +55,13 @@ def own_sd(stated: Information, keys: tuple[Key, ...] = KEYS) -> Array:
 @example(12000)
 @settings(max_examples=40)
 def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
-    """However far the shifts are; what was stated of nothing is as wide as the shifts have it."""
+    """For any size of the shifts; numbers without a prior are as wide as the shifts."""
     seen, stated, rng = known(seed)
     size = rng.standard_normal(len(KEYS)) * own_sd(stated).min() * 10.0 ** rng.uniform(-2.0, 5.0)
     shifts = list(size * rng.standard_normal((3, len(KEYS))))
     told = Posterior(seen + stated, stated=stated)
     wider = (told.widened(KEYS, shifts), told.with_alternatives(KEYS, shifts, [0.3, 0.2, 0.1]))
-    # A statement that says 1e-9 of what observations do beside it is below rounding: infinite before anything widens.
+    # A prior with 1e-9 of the observations' information is below rounding: infinite before anything widens.
     limit = np.where(np.isinf(told.spread.sd), np.inf, np.fmax(own_sd(stated), told.spread.sd))
     for posterior in wider:
         each = posterior.mixture()
@@ -75,7 +75,7 @@ def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
 @given(st.integers(0, 2**31), st.floats(-2.0, 4.0))
 @settings(max_examples=40)
 def test_errors_that_go_together_widen_no_prior(seed: int, strength: float) -> None:
-    """The score of the observations scatters as much as anything; what was stated stays."""
+    """However much the observations' score scatters, the prior's information is unchanged."""
     rng = np.random.default_rng(seed)
     rows, half = rng.standard_normal((8, len(KEYS))), rng.standard_normal((len(KEYS), len(KEYS)))
     seen, stated = Information(KEYS, rows.T @ rows), Information.of_sigmas({KEYS[1]: 0.1, KEYS[3]: 3.0})
@@ -90,7 +90,7 @@ def test_errors_that_go_together_widen_no_prior(seed: int, strength: float) -> N
 @given(st.integers(0, 2**31))
 @settings(max_examples=40)
 def test_ends_are_no_farther_than_stated(seed: int) -> None:
-    """sd with bends is that of the observations' information widened, beside what was stated."""
+    """The sd with bends is that of the widened information of the observations together with the prior."""
     rng = np.random.default_rng(seed)
     units = 10.0 ** rng.uniform(-3.0, 3.0, len(KEYS))
     rows = rng.standard_normal((8, len(KEYS))) / units
@@ -109,7 +109,7 @@ def test_ends_are_no_farther_than_stated(seed: int) -> None:
 @given(st.integers(0, 2**31))
 @settings(max_examples=30)
 def test_straight_curves_are_the_normal_distribution(seed: int) -> None:
-    """Components along weak directions that do not bend have its moments, and nearly its bounds."""
+    """Components along weak directions without bends have the same moments, and nearly the same bounds."""
     rng = np.random.default_rng(seed)
     units, count = 10.0 ** rng.uniform(-3.0, 3.0, len(KEYS)), int(rng.integers(1, 5))
     rows = rng.standard_normal((8, len(KEYS))) / units
@@ -136,7 +136,7 @@ def test_a_valley_ends_where_the_prior_does() -> None:
     assert np.array_equal(back.bounds, posterior.bounds) and np.array_equal(back.sd, posterior.sd)
 
 
-@pytest.mark.parametrize("far_up", [4.0, 1e6])  # standard deviations; the farther one was 8 million components
+@pytest.mark.parametrize("far_up", [4.0, 1e6])  # standard deviations; the farther one once had 8 million components
 def test_a_steep_valley_has_few_components(far_up: float) -> None:
     steps = np.column_stack([np.linspace(-30.0, 30.0, 3), np.zeros((3, 4))])
     across = tuple(Information(KEYS[1:], np.eye(4)) for _ in steps)
@@ -146,7 +146,7 @@ def test_a_steep_valley_has_few_components(far_up: float) -> None:
 
 
 def test_nodes_beyond_all_quantiles_are_not_extrapolated() -> None:
-    """Two nodes beyond eight standard deviations whose cost is almost equal: variances of -2 between them."""
+    """Two nodes beyond eight standard deviations with almost equal cost: variances of -2 between them."""
     steps = np.column_stack([np.linspace(-300.0, 300.0, 13), np.zeros((13, 4))])
     across = [Information(KEYS[1:], np.eye(4) * (1.0 + number)) for number in range(13)]
     roots = np.concatenate([[-8.401, -8.404, -8.2, -7.0, -4.0], np.linspace(-1.0, 1.0, 5), [4.0, 9.001, 9.0]])
@@ -157,7 +157,7 @@ def test_nodes_beyond_all_quantiles_are_not_extrapolated() -> None:
 
 
 def test_files_of_before_are_read() -> None:
-    """Their valley, and one end of each weak direction, are the mixtures that they would be today."""
+    """Their valley, and one end of each weak direction, become the mixtures that they would be today."""
     steps = np.column_stack([np.linspace(-30.0, 30.0, 13), np.zeros((13, 4))])
     rises, across = np.linspace(-3.0, 3.0, 13) ** 2, Information(KEYS[1:], np.eye(4))
     known = Information(KEYS, np.eye(5))
@@ -208,7 +208,7 @@ def test_absent_keys_are_zero() -> None:
 
 @cache
 def seen(tilt_deg: float, spacing_m: float = 0.2, aside_m: float = 0.0) -> Observations:
-    """A field, one line of it aside, from a camera at 4 m."""
+    """A field with one displaced line, from a camera at 4 m."""
     pose = overhead_pose(0.1, -0.2, 4.0, tilt_x_deg=tilt_deg, yaw_deg=3.0)
     stations = {"overhead": Station("overhead", pose)}
     scene = field_scene(ssl_field("B"), {"overhead": camera("radial-2-3")}, stations, spacing_m=spacing_m)
@@ -272,7 +272,7 @@ def test_no_sd_exceeds_its_own_priors(name: str) -> None:
 
 @pytest.mark.thorough
 def test_two_cameras_from_straight_above() -> None:
-    """In one camera's valley the other has no keys; a height stated for one of them says nothing of the other's."""
+    """The mixture of one camera has no keys of the other; a prior on one height gives nothing for the other."""
     cameras, _ = side_by_side(camera("radial-2-3"))
     stations = {
         name: Station(name, overhead_pose(x_m, 0.0, 4.4, yaw_deg=90.0))

@@ -1,4 +1,4 @@
-"""Pictures that were stretched one way, of a field alone: by formulas of OpenCV's, without a word from anybody."""
+"""Pictures stretched in one direction, of a field alone, by OpenCV's formulas, without any option."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.scene.curves import Segment
 from ceres_cal.scene.targets import ssl_field
 
-_CAMERAS = {  # phi, middle, k1 k2, turn, place
+_CAMERAS = {  # phi, centre, k1 k2, rotation, place
     "tilted": (1197.2, (644.7, 505.6), (-0.1405, 0.0052), (-2.9379, -0.0406, 0.7903), (1.116, 1.121, 3.1)),
     "about straight down": (664.5, (634.0, 507.4), (-0.0702, 0.0008), (-2.977, -0.0054, 0.0658), (-1.23, 0.387, 4.692)),
 }
@@ -20,7 +20,7 @@ _SIZE = (1280, 1024)
 
 
 class _StretchedCamera:
-    """A camera above a division B field whose fy is not its fx."""
+    """A camera above a division B field with different fx and fy."""
 
     def __init__(self, camera: str, aspect: float) -> None:
         phi, (x, y), (k1, k2), turn, place = _CAMERAS[camera]
@@ -29,7 +29,7 @@ class _StretchedCamera:
         self.shift = -cv2.Rodrigues(self.turn)[0] @ np.array(place)
 
     def shown(self, places: Array) -> Array:
-        """Pixels (N, 2), NaN outside the picture, and where the lens folds."""
+        """Pixels (N, 2), NaN outside the picture, and beyond a fold of the lens."""
         pixels = np.array(cv2.projectPoints(places, self.turn, self.shift, self.matrix, self.lens)[0], dtype=float)
         flat = pixels.reshape(-1, 2)
         rays = places @ cv2.Rodrigues(self.turn)[0].T + self.shift
@@ -38,7 +38,7 @@ class _StretchedCamera:
         return np.where(inside[:, None], flat, np.nan)
 
     def seen(self, seed: int, camera: str = "camera") -> Observations:
-        """Corners and places on lines, to .15 px."""
+        """Corners and places on lines, with errors of 0.15 px."""
         field, rng = ssl_field("B"), np.random.default_rng(seed)
         corners = self.shown(field.point_array)
         corners += rng.normal(0.0, 0.15, corners.shape)
@@ -55,7 +55,7 @@ class _StretchedCamera:
 
 
 def _off_over_stated(calibration: Calibration, camera: _StretchedCamera, name: str = "camera") -> float:
-    """The farthest of places over the field, .15 m above it, over its 95 % radius."""
+    """Largest error of places 0.15 m above the field, over its 95 % radius."""
     x, y = np.meshgrid(np.linspace(-4.0, 4.0, 9), np.linspace(-2.5, 2.5, 6))
     places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.15)])
     pixels = camera.shown(places)
@@ -66,7 +66,7 @@ def _off_over_stated(calibration: Calibration, camera: _StretchedCamera, name: s
 
 @pytest.mark.parametrize(("name", "aspect"), [("tilted", 1.0263), ("about straight down", 0.971)])
 def test_a_stretched_picture_is_one_by_itself(name: str, aspect: float) -> None:
-    """It was taken for square, to .0005, at 5 standard deviations of the observations; robot height 20 radii off."""
+    """It was taken as square to 0.0005, against 5 standard deviations; errors at robot height were 20 radii."""
     camera = _StretchedCamera(name, aspect)
     calibration = calibrate(camera.seen(3))
     known = calibration.uncertainty.verdict("camera", "camera", "aspect")
@@ -86,7 +86,7 @@ def test_square_pixels_stay_square(name: str) -> None:
 
 @pytest.mark.parametrize("aspects", [(1.02, 1.02), (1.0, 1.03), (1.0, 1.0)])
 def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, float]) -> None:
-    """Both came out square, to .0005: robot height was 19 radii off."""
+    """Both were taken as square to 0.0005: errors at robot height were 19 radii."""
     cameras = {name: _StretchedCamera(name, aspect) for name, aspect in zip(_CAMERAS, aspects, strict=True)}
     tilted, straight = (camera.seen(5, name) for name, camera in cameras.items())
     calibration = calibrate(tilted + straight)
@@ -97,11 +97,13 @@ def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, floa
 
 
 def test_what_is_not_told_is_no_stretched_picture() -> None:
-    """Straight from above fy / fx is open, and the calibration failed: its probability was not a number."""
+    """From straight above fy / fx is open, and the calibration failed: its probability was NaN."""
     assert _probability({}) == _probability({"a": (1.002, np.inf)}) == 0.0
     assert _probability({"a": (1.03, 0.005), "b": (1.0, np.inf)}) == _probability({"a": (1.03, 0.005)}) > 0.9
 
 
 def test_what_is_usual_of_cameras_is_no_stretched_picture() -> None:
-    """fy / fx of 1.0003, known to 3e-5, freed that of every camera of a rig: of one it came out .991 where it is 1."""
+    """fy / fx of 1.0003, known to 3e-5, freed it for every camera of a rig: for one the result was
+    0.991 instead of 1.
+    """
     assert _probability({"a": (1.0003, 3e-5), "b": (0.991, 0.011)}) < 0.01

@@ -1,4 +1,4 @@
-"""The target as built: what the numbers move, and that painted offsets and bent boards come back."""
+"""The target as built: effects of its numbers, and recovery of painted offsets and bent boards."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def painted(offsets_m: dict[str, float]) -> Target:
 
 
 def as_drawn(observations: Observations) -> Observations:
-    """The same pixels, said to show the field as drawn."""
+    """The same pixels with the field as drawn as target."""
     built = observations.targets["field"]
     index = np.array([FIELD.curve_names.index(name) for name in built.curve_names], dtype=np.int32)
     curves = observations.curves
@@ -72,7 +72,7 @@ def from_six_stations(seed: int) -> tuple[dict[str, float], Observations]:
 
 
 def left_over(errors: dict[str, float]) -> Array:
-    """Errors of the lines' offsets when shift, turn and scale of the whole field are taken out."""
+    """Errors of the lines' offsets after shift, rotation and scale of the whole field are removed."""
     rows = []
     for name in errors:
         curve = FIELD.curves[name]
@@ -120,7 +120,7 @@ def test_a_bent_board_is_straightened(named: bool) -> None:
 
 
 def test_a_warp_of_before_is_bowed_alone(tmp_path: Path) -> None:
-    """What 0.1 saved knows two bows."""
+    """Files of 0.1 contain two bows."""
     board = checkerboard(9, 6, 0.1)
     stations = {"a": Station("a", overhead_pose(0.0, 0.0, 4.0, 0.0, 0.0, 0.0))}
     observations = simulate(board_scene(board, {"a": CAMERA}, stations, count=6, seed=3), NOISE, 3).observations

@@ -30,7 +30,7 @@ EXTENTS = np.array([0.92, 0.69])
 
 
 def rays() -> Array:
-    """(7, 3): within the grid, and two beyond its edge."""
+    """(7, 3): inside the grid, and two beyond its edge."""
     rng = np.random.default_rng(3)
     across = np.vstack([rng.uniform(-0.5, 0.5, (5, 2)), (0.2, 0.75), (-1.05, 0.1)])
     return np.column_stack([across, np.ones(len(across))])
@@ -71,7 +71,7 @@ def test_there_and_back() -> None:
 
 
 def test_it_may_end_in_one_direction_alone() -> None:
-    """Where nobody observed: the rest of the picture has its answers."""
+    """In a direction without observations; the rest of the picture is not affected."""
     heights = np.zeros((COLUMNS, ROWS, 2))
     heights[0, :, 0] = 400.0  # the left edge is folded back
     named = {**CAMERA.lens.coefficients, **dict(zip(NODES, heights.ravel().tolist(), strict=True))}
@@ -105,7 +105,7 @@ def test_the_same_beyond_its_edge() -> None:
 
 
 def test_low_powers_are_left_to_the_rest_of_the_lens() -> None:
-    """How large a surface of each shape is for one standard deviation of its prior."""
+    """Size of a surface of each shape for one standard deviation of its prior."""
     x, y = (np.linspace(-1.0, 1.0, count) * (count - 1) / (count - 3) for count in (COLUMNS, ROWS))
 
     def size(shape: Array) -> float:
@@ -128,7 +128,7 @@ def test_it_is_asked_for_by_its_name() -> None:
 
 
 def test_fewer_observations_than_numbers_leave_a_cost_to_rely_on() -> None:
-    """Rounding in what they leave open had made it thousands of times as large, and another one at each look."""
+    """Rounding in the open directions made it thousands of times too large, with another value at each evaluation."""
     seen = simulate(scenes.lines("brown"), Disturbance(curves_sigma_px=0.3), 1).observations
     options = Options(lens="spline", terms=("surface",), max_iterations=6)
     start = initialise(gather_sights(seen), options).estimate

@@ -1,4 +1,4 @@
-"""An effect that nobody has heard of, in one file: solved for, in the covariance, diagnosed and reported."""
+"""A new effect in one file: solved for, in the covariance, diagnosed and reported."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,7 +23,7 @@ from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.quantities import difference
 from ceres_cal.simulate import Disturbance, simulate
 
-SWAY_PX, PERIOD_PX = 1.5, 1500.0  # long: the camera takes up a part of it
+SWAY_PX, PERIOD_PX = 1.5, 1500.0  # long, so that the camera absorbs a part of it
 
 FILE = f'''"""Rows of pixels that sway."""
 
@@ -55,7 +55,7 @@ EFFECTS = (Effect("sway", swaying, words, absorbed=True, prior=SizePrior(0.9, (0
 
 @pytest.fixture(scope="module")
 def added(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The file, put into the folder of the table."""
+    """The file in the folder of the table."""
     folder = tmp_path_factory.mktemp("table")
     (folder / "sway.py").write_text(FILE)
     table.__path__.append(str(folder))
@@ -83,12 +83,12 @@ def without(swayed: Observations) -> Calibration:
 
 @pytest.fixture(scope="module")
 def calibration(without: Calibration, swayed: Observations, added: None) -> Calibration:
-    """After the one without it."""
+    """After the calibration without it."""
     return calibrate(swayed, RADIAL)
 
 
 def off(calibration: Calibration) -> Array:
-    """(K,) standard deviations by which the camera's numbers are off."""
+    """(K,) errors of the camera's numbers in standard deviations."""
     posterior = calibration.uncertainty.posterior
     keys = [key for key in posterior.keys if key.kind == "camera"]
     truth = replace(calibration.estimate, cameras=scenes.overhead().cameras)
@@ -108,7 +108,7 @@ def test_it_is_solved_for(calibration: Calibration, without: Calibration) -> Non
 
 
 def test_it_widens(calibration: Calibration) -> None:
-    """By what is open of its amounts: the same noise before a steady camera says more."""
+    """By the uncertainty of its amounts: the same noise with a steady camera gives more information."""
     steady = calibrate(simulate(scenes.overhead(boards=8), scenes.NOISE, 1).observations, RADIAL)
     sds = [one.uncertainty.posterior.sd for one in (calibration, steady)]
     assert np.all(sds[0] > 0.99 * sds[1]) and np.max(sds[0] / sds[1]) > 1.1
@@ -132,11 +132,11 @@ def test_sound_data_are_left_alone(added: None) -> None:
         assert not any(one.amounts for one in calibrate(sound, RADIAL).effects)
 
 
-# ---- an effect that is stated with the observations ------------------------------------------------------------------
+# ---- an effect that is stated with the observations -----------------------------------------------------------------
 
 
 def over_stated(coma_px: float, *stated: Prior) -> float:
-    """Error over the stated one, root mean squares on the floor, of lines that coma drew outwards by so much."""
+    """Root mean square error on the floor over the stated one, for lines that coma displaces outwards by so much."""
     scene = scene_of(SetUp(1, 20.0, AUTO, False, False), np.random.default_rng(4))
     (name,) = scene.stations
     camera = scene.camera_at(name)
@@ -160,7 +160,7 @@ def over_stated(coma_px: float, *stated: Prior) -> float:
 
 @pytest.mark.parametrize("coma_px", [3.0, -3.0])
 def test_coma_that_is_stated_is_in_the_standard_deviations(coma_px: float) -> None:
-    """A lens takes up what it draws outwards, so no residual tells."""
+    """A lens absorbs the outward displacement, so that no residual shows it."""
     assert over_stated(coma_px) > 2.0  # 4.2 and 2.9
     assert 0.5 < over_stated(coma_px, Prior("camera", "c0", COMA, (0.0,), (3.0,))) < 1.6  # 1.35 and 0.92
 

@@ -31,7 +31,7 @@ def test_ends() -> None:
 @given(st.floats(0.01, 1e4), st.integers(1, 30), st.integers(3, 200_000))
 def test_tail_of_f(value: float, d1: int, d2: int) -> None:
     expected = stats.f.logsf(value, d1, d2)
-    if expected > -600.0:  # scipy's own underflows
+    if expected > -600.0:  # scipy's underflows
         assert float(log_f_tail(value, d1, d2)) == pytest.approx(expected, rel=2e-8, abs=2e-8)
 
 
@@ -54,7 +54,7 @@ def test_tails_do_not_underflow() -> None:
 
 
 def test_many_at_once_are_as_each_alone() -> None:
-    """The sums go on until all have converged, so that each may have some terms more than it needs."""
+    """The sums continue until all have converged, so that each may have more terms than it needs."""
     values, freedoms = np.array([[0.0], [3.0], [40.0], [np.inf]]), np.array([1.0, 7.5, 300.0])
     for tail in (log_chi2_tail, lambda value, d2: log_f_tail(value, 4.0, d2)):
         together = tail(values, freedoms)
@@ -65,7 +65,7 @@ def test_many_at_once_are_as_each_alone() -> None:
 
 @pytest.mark.parametrize("freedom", [np.inf, 60.0])
 def test_quadratic_tails(freedom: float) -> None:
-    """Against a central and a noncentral variable of scipy's, and a sum of unlike ones that is drawn."""
+    """Compared with scipy's central and noncentral variables, and with a sampled sum of unequal ones."""
     one = np.ones(5)
     expected = stats.chi2.sf(15.0, 5) if np.isinf(freedom) else stats.f.sf(3.0, 5, freedom)
     assert quadratic_tail(15.0, one, 0.0 * one, freedom) == pytest.approx(float(expected), rel=0.02)  # 1e-5; 0.3 %

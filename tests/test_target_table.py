@@ -1,4 +1,4 @@
-"""The table of target kinds: kinds that nobody has heard of do all that the built-in ones do."""
+"""The table of target kinds: new kinds do all that the built-in ones do."""
 
 import json
 from dataclasses import replace
@@ -26,7 +26,7 @@ from ceres_cal.simulate import Disturbance, Simulation, Station, scene_from_json
 
 
 def court(size_m: float) -> Target:
-    """A field of its own: a square with a circle in the middle."""
+    """A field of a new kind: a square with a circle in the middle."""
     half, sizes = 0.5 * size_m, {"near": (-1, -1), "right": (1, -1), "far": (1, 1), "left": (-1, 1)}
     corners = {name: (x * half, y * half, 0.0) for name, (x, y) in sizes.items()}
     ends = list(corners.values())
@@ -39,7 +39,7 @@ def court(size_m: float) -> Target:
 
 
 def dots(columns: int, rows: int, spacing_m: float) -> Target:
-    """A board of dots, which nobody detects but which lies anywhere and bows."""
+    """A board of dots, which cannot be detected but can be placed anywhere and bowed."""
     spec = {"kind": "dots", "columns": columns, "rows": rows, "spacing_m": spacing_m}
     places = {f"dot_{r}_{c}": (c * spacing_m, r * spacing_m, 0.0) for r in range(rows) for c in range(columns)}
     return Target(spec, places, {}, movable=True, bows=True, grid=Grid(columns, rows, spacing_m))
@@ -119,7 +119,7 @@ def test_the_command_line_offers_it(capsys: pytest.CaptureFixture[str], tmp_path
         assert main(["targets", name]) == 0
         assert feature in capsys.readouterr().out
     assert main(["targets", "--help"]) == 0
-    said = " ".join(capsys.readouterr().out.split()).replace("- ", "-")  # however it is wrapped
+    said = " ".join(capsys.readouterr().out.split()).replace("- ", "-")  # however the lines are wrapped
     assert "court" in said and "centre-court" in said
     assert {"ssl-a", "ssl-b", "vss-3", "centre-court"} <= set(targets_by_name())
     field = ["detect", "field", str(tmp_path / "no.png"), "--auto", "-o", str(tmp_path / "o.json")]
@@ -145,7 +145,7 @@ def test_what_is_asked_of_a_target_is_its_own() -> None:
 
 
 def test_what_is_mistaken_for_another_field_keeps_its_names() -> None:
-    """The two very small fields number their features otherwise; those of a larger one are not all there."""
+    """The two smallest fields number their features differently; not all features of a larger one exist."""
     small, large = painted_field("vss-field", "3v3"), painted_field("vss-field", "5v5")
     both = [name for name in small.point_names if name in large.points]
     assert any(small.point_names.index(name) != large.point_names.index(name) for name in both)

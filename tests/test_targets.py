@@ -1,4 +1,4 @@
-"""Targets: dimensions as the rules have them, features where their names say, and specs that come back equal."""
+"""Targets: dimensions according to the rules, features at their named places, and specs with exact round trips."""
 
 import json
 import re
@@ -52,7 +52,7 @@ def on(curve: Curve, s: Array, side: int = 0) -> Array:
 
 
 def distance(curve: Curve, point: tuple[float, float, float]) -> float:
-    """From a point to the nearest place within a curve's ends, m."""
+    """Distance of a point from the nearest place between a curve's ends, m."""
     s = nearest_on_track(curve.track()[None], np.array([isinstance(curve, Arc)]), np.array([point]))
     first, last = curve.parameter_range
     s = first + (s - first) % (2.0 * np.pi) if isinstance(curve, Arc) else np.clip(s, first, last)
@@ -129,7 +129,7 @@ def test_points_lie_where_the_lines_of_their_names_cross(field: Target) -> None:
 
 
 def test_sides_of_the_penalty_areas_are_those_of_the_leagues_vision() -> None:
-    # Simulators have been seen to send left and right the other way round.
+    # Some simulators exchange left and right.
     field = ssl_field("B")
     ys = {name: curve.track()[0, 1] for name, curve in field.curves.items() if name.count("Field")}
     assert ys == {
@@ -349,7 +349,7 @@ def test_numbers_of_any_kind_make_the_same_target() -> None:
 
 
 def test_the_order_of_features_counts() -> None:
-    # Observations number the features: two orders are two targets.
+    # Observations use the numbers of features: two orders are two targets.
     one, other = (
         custom({"a": (0.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0)}),
         custom({"b": (1.0, 0.0, 0.0), "a": (0.0, 0.0, 0.0)}),
@@ -436,7 +436,7 @@ def test_a_curve_of_no_numbers_is_named(number: Any) -> None:
 
 
 def test_a_target_of_nan_is_refused_however_it_is_made() -> None:
-    """From Python, too: a NaN in a line would be one in every number of the calibration."""
+    """Also from Python: a NaN in a line would make every number of the calibration NaN."""
     line = Segment((0.0, 0.0, 0.0), (np.nan, 0.0, 0.0))
     with pytest.raises(InputError, match="custom: curve 'e' needs finite numbers"):
         Target({"kind": "custom"}, {}, {"e": line})

@@ -1,4 +1,4 @@
-"""Numbers that are 0 unless asked for: OpenCV's rational and thin-prism terms, a fisheye's decentring, skew."""
+"""Numbers that are 0 by default: OpenCV's rational and thin-prism terms, a fisheye's decentring, skew."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ceres_cal.start.initialise import initialise
 
 
 def seen(lens: str, camera: Camera | None = None, sigma_px: float = 0.1) -> Simulation:
-    """Boards before a camera of `scenes`, or before another one."""
+    """Boards in front of a camera of `scenes`, or of another one."""
     scene = scenes.boards("kannala-brandt" if lens.startswith("kannala") else "brown")
     scene = replace(scene, cameras=dict.fromkeys(scene.cameras, camera or scenes.camera(lens)))
     return simulate(scene, Disturbance(points_sigma_px=sigma_px), seed=5)
@@ -99,7 +99,7 @@ def test_a_thin_prism_is_named() -> None:
 
 
 def test_the_optimum_is_opencvs(real_data: Path) -> None:
-    """Its rational model on its own photographs, to 1e-6 of rms: measured 5e-8, its corners being float32."""
+    """Its rational model on its own photographs, to 1e-6 of rms: measured 5e-8 with corners in float32."""
     board, corners = checkerboard(9, 6, 0.025), []
     for path in sorted((real_data / "opencv_left_right").glob("right*.jpg")):
         picture: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)

@@ -1,4 +1,4 @@
-"""Work in parts: every item once, whatever the number of threads."""
+"""Work in parts: every item once, for any number of threads."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_little_work_stays_in_one_part() -> None:
 
 
 def test_the_part_of_the_caller_is_the_largest() -> None:
-    """Another thread begins later; with very much work that no longer tells."""
+    """Other threads start later; for very much work this is negligible."""
     with at_most(2):
         few, many = parts_of(1000, 10_000, 60.0), parts_of(1000, 10**7, 60.0)
     assert few[1] > 550
@@ -62,7 +62,7 @@ def test_two_items_are_at_work_at_once_and_the_rest_ends_with_an_error() -> None
     def work(item: int) -> int:
         seen.append(item)
         if item < 2:
-            both.wait(10.0)  # breaks where they come one after the other
+            both.wait(10.0)  # fails if they run one after the other
         if item == 1:
             raise ValueError("the second")
         return item
@@ -73,7 +73,7 @@ def test_two_items_are_at_work_at_once_and_the_rest_ends_with_an_error() -> None
 
 
 def test_work_that_is_left_writes_no_more_files_and_ends_the_one_that_it_writes(tmp_path: Path) -> None:
-    """And what it had written is known to whoever waited for it."""
+    """A waiting caller knows the files that were written."""
     begun, ended = threading.Event(), threading.Event()
 
     def work() -> None:

@@ -1,4 +1,4 @@
-"""Rigid transforms: the group's axioms, exp and log up to the angle pi, and the paper's angles up to gimbal lock."""
+"""Rigid transforms: group axioms, exp and log up to the angle pi, and the paper's angles up to gimbal lock."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from ceres_cal.base.transforms import (
     skew,
 )
 
-# Where formulas change over or lose digits: next to nothing, the switch to the series, (just short of) half a turn.
+# Angles where formulas change or lose digits: near 0, at the switch to the series, and at or just below pi.
 CRITICAL_ANGLES = (0.0, 1e-300, 1e-12, 1e-8, 0.999e-4, 1.001e-4, np.pi - 1e-7, np.pi - 1e-12, np.pi)
 
 quick = settings(deadline=None, max_examples=40)
@@ -182,7 +182,7 @@ def test_the_papers_angles_come_back(alpha: float, beta: float, gamma: float) ->
 @quick
 @given(angles, st.sampled_from([-1.0, 1.0]), st.just(0.0) | st.floats(-17.0, -1.0).map(lambda e: 10.0**e), angles)
 def test_the_papers_rotation_comes_back_near_gimbal_lock(alpha: float, sign: float, short: float, gamma: float) -> None:
-    # alpha and gamma are known here to 1e-16 / cos(beta) only, but their errors must make up for each other.
+    # alpha and gamma are known here only to 1e-16 / cos(beta), but their errors must compensate each other.
     rotation = rotation_from_euler(alpha, sign * (np.pi / 2 - short), gamma)
     angles_back = euler_from_rotation(rotation)
     assert abs(angles_back[1]) <= np.pi / 2
@@ -193,7 +193,7 @@ def test_the_papers_rotation_comes_back_near_gimbal_lock(alpha: float, sign: flo
 def test_gamma_is_zero_at_gimbal_lock(sign: float) -> None:
     alpha, beta, gamma = euler_from_rotation(rotation_from_euler(0.4, sign * np.pi / 2, 0.3))
     assert gamma == 0.0 and beta == sign * np.pi / 2
-    assert alpha == pytest.approx(0.4 - sign * 0.3, abs=1e-15)  # only this combination is left
+    assert alpha == pytest.approx(0.4 - sign * 0.3, abs=1e-15)  # only this combination is determined
 
 
 def test_numbers_too_large_for_a_rotation_are_refused_without_a_warning() -> None:

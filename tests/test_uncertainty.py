@@ -1,4 +1,4 @@
-"""Verdicts, profile bounds, maps in mm and seams, against what was built in and against brute force.
+"""Verdicts, profile bounds, maps in mm and seams, compared with expected results and with brute force.
 
 `scripts/accuracy/intervals.py` has the full samples; here are small ones.
 """
@@ -69,11 +69,11 @@ def phi_of(calibration: Calibration, name: str = "overhead") -> Verdict:
     return calibration.uncertainty.verdict("camera", name, "phi")
 
 
-# ---- what straight above cannot tell --------------------------------------------------------------------------------
+# ---- views from straight above --------------------------------------------------------------------------------------
 
 
 def test_a_frontal_view_is_unknown_where_opencv_says_sd_nought() -> None:
-    """The same pixels: OpenCV answers a phi that is no lens, with a standard deviation of 0.00."""
+    """For the same pixels OpenCV returns an impossible phi with a standard deviation of 0.00."""
     x, y = np.meshgrid(np.linspace(-4.0, 4.0, 9), np.linspace(-3.0, 3.0, 7))
     board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float32)
     noise = 0.3 * np.random.default_rng(0).standard_normal((x.size, 2))
@@ -98,13 +98,13 @@ def test_a_frontal_view_is_unknown_where_opencv_says_sd_nought() -> None:
 
 
 def exactly_frontal() -> Uncertainty:
-    """The posterior at the truth of a camera that looks straight down."""
+    """The posterior at the truth for a camera that looks straight down."""
     trial = make_trial(tilted(0.0), CLEAN_NOISE, 0)
     return Uncertainty(trial.truth, Posterior(bound(trial)), trial.observations.targets)
 
 
 def test_straight_down_is_an_exact_null_direction() -> None:
-    """phi and height have no sigma at all; their ratio has, the floor has, and nothing above the floor."""
+    """phi and height have infinite sigmas; their ratio and the floor have finite ones, places above the floor not."""
     known = exactly_frontal()
     sd = dict(zip([key.quantity for key in known.posterior.keys], known.posterior.sd, strict=True))
     assert {name for name, sigma in sd.items() if np.isinf(sigma)} == {"phi", "height"}
@@ -131,7 +131,7 @@ def test_more_tilt_tells_more(tilt_deg: float, verdict: str) -> None:
 
 
 def problem_at(calibration: Calibration, observations: Observations, phi: float | None) -> tuple[Problem, Estimate]:
-    """At the calibration's noise, with phi held somewhere or free; and an estimate to begin at."""
+    """The problem with the calibration's noise, with phi fixed or free, and an initial estimate."""
     options = Options(usual_camera=False, lens="radial", fixed={} if phi is None else {"phi": phi})
     fit, estimate = calibration.fit, calibration.estimate
     if phi is not None:
@@ -157,7 +157,7 @@ def cost_at(calibration: Calibration, observations: Observations, phi: float | N
 
 @pytest.mark.parametrize("half_width", [1.96, 4.5])
 def test_a_valley_is_followed_beyond_its_bounds(half_width: float) -> None:
-    """Few degrees of freedom have them farther out than three sigma: else both ends were open, and phi anything."""
+    """With few degrees of freedom they are beyond three sigma; both ends were open, and phi unlimited."""
     calibration = calibrated(3.0)
     nodes = valley("overhead", *problem_at(calibration, observed(3.0), None), 1.0, half_width)
     costs = np.array([node.cost for node in nodes])
@@ -166,7 +166,7 @@ def test_a_valley_is_followed_beyond_its_bounds(half_width: float) -> None:
 
 @pytest.mark.parametrize("tilt_deg", [3.0, 1.0])
 def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
-    """By other solves, from other starts: the rise at the bound is that of a 95 % interval, Student's t squared."""
+    """With other solves from other initial values: the rise at the bound is that of a 95 % interval, t squared."""
     observations = observed(tilt_deg)
     calibration = calibrate(observations, replace(RADIAL, as_built="as drawn"))
     posterior = calibration.posterior
@@ -185,13 +185,13 @@ def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
 
 @pytest.mark.parametrize("share, is_known", [(0.02, True), (0.08, False)])
 def test_a_thin_tail_in_which_nothing_is_known(share: float, is_known: bool) -> None:
-    """95 % of the errors are shorter than something as long as less than 5 % of them are not known."""
+    """A 95 % radius is finite as long as less than 5 % of the distribution is unknown."""
     weights, means = np.array([1.0 - share, share]), np.zeros((2, 1, 2))
     known = np.array([np.eye(2), np.diag([np.inf, np.inf])])[:, None]
     ((radius,),) = radii(weights, means, known)
     low, high = quantiles(weights, means, np.diagonal(known, axis1=-2, axis2=-1), 1.96)
     assert np.isfinite([radius, *low[0], *high[0]]).tolist() == [is_known] * 5
-    if is_known:  # of the part that is known so much lies beyond
+    if is_known:  # share of the known part that is beyond
         assert radius == pytest.approx(np.sqrt(-2.0 * np.log((0.05 - share) / (1.0 - share))), rel=0.01)
 
 
@@ -199,12 +199,12 @@ def test_a_thin_tail_in_which_nothing_is_known(share: float, is_known: bool) -> 
 
 
 def others_of(near: Estimate, *others: Estimate) -> OtherLenses:
-    """Others that are as likely as can be: what they show counts as much as it is."""
+    """Other lenses with the largest possible weight, so that their differences count fully."""
     return OtherLenses(near, others, (2.0,) * len(others), {"overhead": 300.0})
 
 
 def test_another_lens_is_followed_over_the_floor() -> None:
-    """As far as the numbers can: of the same lens with other numbers wholly, of another kind nearly."""
+    """As well as its numbers allow: exactly for the same lens with other numbers, nearly for another kind."""
     calibration = calibrated(25.0)
     near, keys = calibration.estimate, calibration.uncertainty.posterior.keys
     camera = near.camera_at("overhead")
@@ -220,7 +220,9 @@ def test_another_lens_is_followed_over_the_floor() -> None:
 
 
 def test_another_lens_is_followed_where_no_floor_is_seen() -> None:
-    """By the rays alone, and turned as well as can be: a principal point aside is a turn, but for the lens."""
+    """With the rays alone, after the best rotation: another principal point is a rotation, except
+    for the distortion.
+    """
     near = calibrated(25.0).estimate
     keys = [key for key in calibrated(25.0).uncertainty.posterior.keys if key.kind == "camera"]
     step = np.array([{"phi": 5.0, "cx": 2.0}.get(key.quantity, 0.0) for key in keys])
@@ -229,7 +231,7 @@ def test_another_lens_is_followed_where_no_floor_is_seen() -> None:
 
 
 def test_another_lens_widens_a_valley_on_the_floor_alike_at_every_phi() -> None:
-    """What it shows beside the lines is the same wherever the camera hangs that the lines leave open."""
+    """Its difference beside the lines is the same for every camera height that the lines leave open."""
     calibration = calibrated(1.0)
     posterior, estimate = calibration.uncertainty.posterior, calibration.estimate
     camera = estimate.cameras["overhead"]
@@ -249,7 +251,7 @@ def test_another_lens_widens_a_valley_on_the_floor_alike_at_every_phi() -> None:
 
 @cache
 def seen_in_a_circle(seed: int) -> tuple[Calibration, Camera]:
-    """A field of which only lines within 380 px of the middle are seen, by defaults; and the true camera."""
+    """A field with lines only within 380 px of the centre, calibrated by default; and the true camera."""
     rng = np.random.default_rng(seed)
     kind = list(ODD_LENSES)[seed % 3]
     phi, lens = ODD_LENSES[kind](rng)
@@ -273,7 +275,7 @@ def around(camera: Camera, radius_px: float) -> Array:
 
 @pytest.mark.parametrize("seed", [3, 5, 20])
 def test_beyond_the_observations_other_lenses_are_what_they_show(seed: int) -> None:
-    """85 px beyond the outermost observation of a lens that is chosen by the data."""
+    """85 px beyond the outermost observation, for a lens that was chosen by default."""
     calibration, truth = seen_in_a_circle(seed)
     pixels = around(truth, 465.0)
     shown = np.isfinite(truth.locate(pixels)[:, 0])
@@ -284,7 +286,7 @@ def test_beyond_the_observations_other_lenses_are_what_they_show(seed: int) -> N
 
 @pytest.mark.parametrize("seed", [2, 7])
 def test_straight_from_above_the_floor_is_known_though_phi_is_not(seed: int) -> None:
-    """Where errors go together (2), and where the unknown direction moves the lens by rounding (7)."""
+    """With correlated errors (2), and with an unknown direction that changes the lens only by rounding (7)."""
     calibration = calibrated(0.0, seed)
     floor = calibration.uncertainty.map_sd_mm("overhead", 0.0)
     assert calibration.uncertainty.posterior.followed and phi_of(calibration).verdict == "unknown"
@@ -292,7 +294,7 @@ def test_straight_from_above_the_floor_is_known_though_phi_is_not(seed: int) -> 
 
 
 def test_a_valley_is_as_wide_across_at_each_node_as_where_it_was_asked() -> None:
-    """On the floor, but for its ends: where errors go together it is half as wide again as by the model."""
+    """On the floor, except at its ends: with correlated errors it is half as wide again as in the model."""
     known = calibrated(0.0, 7).uncertainty
     posterior, estimate = known.posterior, known.estimate
     mixture, places = posterior.mixtures["overhead"], located_by("overhead", np.array([[300.0, 300.0]]), 0.0)
@@ -309,8 +311,8 @@ def test_a_valley_is_as_wide_across_at_each_node_as_where_it_was_asked() -> None
 
 
 def test_other_lenses_bend_as_the_chosen_one_does() -> None:
-    """Half a field by one camera, 3 degrees off straight down: phi is known to 6 %, and goes with the height along a
-    curve. Another lens that lies elsewhere on the curve moves nothing on the floor.
+    """Half a field by one camera, 3 degrees from straight down: phi is known to 6 %, and is correlated with the height
+    along a curve. Another lens that differs along the curve changes nothing on the floor.
     """
     camera = Camera((780, 580), 350.0, (392.0, 290.0), RADIAL_LENS)
     station = Station("overhead", overhead_pose(2.4, 0.05, 4.5, 3.0, -0.5, 90.0))
@@ -324,7 +326,7 @@ def test_other_lenses_bend_as_the_chosen_one_does() -> None:
 
 
 def test_phi_is_as_open_as_the_longer_lenses_of_its_kind_leave_it() -> None:
-    """From nearly above one coefficient of a wide lens knows phi and height to 0.8 %, and predicts as well as two."""
+    """From nearly above one coefficient of a wide lens determines phi to 0.8 %, and predicts as well as two."""
     camera = Camera((1280, 960), 568.9, (645.0, 483.0), KannalaBrandt((-0.003, -0.0025, -0.002, 0.0004)))
     station = Station("overhead", overhead_pose(0.5, 0.3, 3.8, 3.0, 3.0))
     scene, off = field_scene(FIELD, {"overhead": camera}, {"overhead": station}, spacing_m=0.4), []
@@ -352,7 +354,7 @@ def test_other_lenses_are_in_the_file(tmp_path: Path) -> None:
 
 
 def test_a_prior_on_phi_is_part_of_its_profile() -> None:
-    """Too wide for the quadratic picture, and almost all that is known: the bounds are the prior's own."""
+    """It is too wide for a quadratic approximation, and is almost all information: the bounds are the prior's own."""
     prior = Prior("camera", "overhead", "phi", (560.0,), (60.0,))
     calibration = calibrate(observed(1.0), Options(usual_camera=False, lens="radial", priors=(prior,)))
     verdict = phi_of(calibration)
@@ -362,7 +364,7 @@ def test_a_prior_on_phi_is_part_of_its_profile() -> None:
 
 @pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_no_camera_a_hands_breadth_over_the_floor(seed: int) -> None:
-    """At 1 degree a quarter of all least costs lie at a phi of a few px, and so do two cameras over an askew field."""
+    """At 1 degree a quarter of all least costs are at a phi of a few px, and so are those of two cameras."""
     for calibration in (
         calibrated(1.0, seed),
         calibrate(painted_by_two_cameras(seed, heights_known=False).observations, RADIAL),
@@ -375,7 +377,7 @@ def test_no_camera_a_hands_breadth_over_the_floor(seed: int) -> None:
 
 
 def test_where_a_usual_lens_was_taken_the_floor_is_as_good() -> None:
-    """Seed 0's least cost lies at 9 px; the floor is known to a millimetre all the same, what is above it is not."""
+    """Seed 0's least cost is at 9 px; the floor is nevertheless known to a millimetre, places above it are not."""
     calibration, truth = calibrated(1.0, 0), make_trial(tilted(1.0), CLEAN_NOISE, 0).truth
     assert phi_of(calibration).low == 0.0 and phi_of(calibration).verdict == "unknown"
     places = np.array([[-4.0, -2.5], [0.0, 0.0], [3.0, 2.0]])
@@ -407,7 +409,9 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
     partly(["tilt 25 deg", "tilt 3 deg", "tilt 1 deg", "tilt 1 deg, height", "boards"], ["tilt 25 deg", "boards"]),
 )
 def test_intervals_hold_what_they_say(name: str) -> None:
-    """Four standard errors around 0.95, by few runs; accuracy/intervals.py has 500 of each, 0.943 to 0.964 measured."""
+    """Four standard errors around 0.95, with few runs; accuracy/intervals.py has 500 of each, 0.943
+    to 0.964 measured.
+    """
     runs = 10
     found, wider = cover(CASES[name], range(runs)), np.sqrt(60.0 / runs)
     assert found.failed == 0
@@ -427,7 +431,7 @@ def test_intervals_hold_what_they_say(name: str) -> None:
 
 
 def drawn(calibration: Calibration, count: int) -> Array:
-    """Steps (count, P) from the estimate, as the posterior has them."""
+    """Samples of steps (count, P) from the estimate, according to the posterior."""
     assert calibration.posterior is not None
     covariance = calibration.posterior.covariance
     return np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, count, method="cholesky")
@@ -544,7 +548,7 @@ def test_the_predicted_seam_is_what_draws_do() -> None:
 
 @pytest.mark.thorough
 def test_two_cameras_disagree_as_expected() -> None:
-    """What is found over what was expected: 1 where points and stretches are what the calibration says they are."""
+    """Measured over expected disagreement: 1 where points and stretches have the stated uncertainty."""
     squares = []
     for seed in range(5):
         observations, calibration = seen_twice(seed)
@@ -590,7 +594,7 @@ def test_a_ring_sheet_does_not_say_how_it_is_turned() -> None:
 
 
 def test_natural_sizes_weigh_coefficients_by_what_they_do() -> None:
-    """A coefficient off by its size moves a pixel half a diagonal from the middle by as much."""
+    """A change of a coefficient by its size moves a pixel half a diagonal from the centre by one pixel."""
     camera = calibrated(25.0).cameras["overhead"]
     keys = [Key("camera", "overhead", name, "") for name in ("a2", "a3", "phi", "cx")]
     radius = unit_px(camera)
@@ -611,7 +615,7 @@ def test_a_file_says_the_same(tilt_deg: float, tmp_path: Path) -> None:
 
 
 def test_a_place_whose_slopes_nothing_tells_is_unknown() -> None:
-    """As where a lens folds at one component of a mixture: infinite, and no warning of NumPy."""
+    """For example at a fold of the lens in one component of a mixture: infinite, and no warning of NumPy."""
     known = calibrated(3.0).uncertainty
     pixels = np.array([[300.0, 300.0], [640.0, 480.0]])
     places = located_by("overhead", pixels, 0.0)
@@ -626,14 +630,14 @@ def test_a_place_whose_slopes_nothing_tells_is_unknown() -> None:
 
 
 def test_a_component_without_weight_tells_nothing() -> None:
-    """Of a valley whose far end is unknown and next to impossible, 0 times infinity was not a number."""
+    """For a valley with an unknown, almost impossible end, 0 times infinity was NaN."""
     means, variances = np.array([[1.0, 0.0], [0.0, np.inf], [2.0, 1.0]]), np.array([[1.0], [1.0], [np.inf]])
     known, unknown = moments(np.array([0.25, 0.75, 0.0]), means, variances * np.ones(2))
     assert known == pytest.approx(1.25**0.5) and unknown == np.inf
 
 
 def test_phi_is_known_no_better_without_what_is_usual() -> None:
-    """Two views that are tilted alike: 9.8 % was said without it where 54 % was known with it."""
+    """Two views with the same tilt: 9.8 % was stated without the priors, and 54 % with them."""
     board, matrix = checkerboard(7, 5, 0.0254), np.array([[810.0, 0.0, 362.0], [0.0, 807.0, 214.0], [0.0, 0.0, 1.0]])
     turns, shifts = (
         ((-0.581, -0.248, -0.015), (-0.272, -0.699, -1.509)),

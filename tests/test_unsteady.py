@@ -1,4 +1,4 @@
-"""Principal points that move from view to view, and a rolling shutter: found, named, and what is stated holds."""
+"""Principal points that move from view to view, and a rolling shutter: found, named, with honest uncertainty."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ FLAT = Board(views=VIEWS)
 
 
 def shifted(seed: int, sigma_px: float) -> Observations:
-    """Views of a flat board whose principal points are off by so much each: all that a view shows is shifted by it."""
+    """Views of a flat board with random principal points: everything in a view is shifted."""
     _, observations = observed(FLAT, seed)
     points = observations.points
     moved = np.random.default_rng(seed).normal(0.0, sigma_px, (len(observations.views), 2))
@@ -37,7 +37,7 @@ def shifted(seed: int, sigma_px: float) -> Observations:
 
 
 def rolling(seed: int, sigma_px: float, board: Board = FLAT) -> Observations:
-    """Views that move by so much, anew in each, while their rows are read out from the first to the last."""
+    """Views with a random motion each, while their rows are read out from the first to the last."""
     _, observations = observed(board, seed)
     points, (_, height) = observations.points, observations.cameras["camera"]
     moved = np.random.default_rng(100 + seed).normal(0.0, sigma_px, (len(observations.views), 2))[points.view]
@@ -46,7 +46,7 @@ def rolling(seed: int, sigma_px: float, board: Board = FLAT) -> Observations:
 
 
 def test_a_shutter_that_rolls_too_little_to_be_taken_off_is_in_what_is_stated() -> None:
-    """Nearly all of it is taken up by poses and by the aspect, which is off by the mean of all views."""
+    """Poses and aspect absorb nearly all of it; the aspect has an error by the mean of all views."""
     for seed in (1, 4, 5):
         calibration = calibrate(rolling(seed, 3.0))
         posterior = calibration.posterior
@@ -59,7 +59,7 @@ def test_a_shutter_that_rolls_too_little_to_be_taken_off_is_in_what_is_stated() 
 
 
 def through_a_moving_pupil(seed: int, views: int) -> Observations:
-    """An equidistant fisheye before near boards: its pupil moves ahead by 6 mm times the square of the angle."""
+    """An equidistant fisheye and near boards: its pupil moves ahead by 6 mm times the square of the angle."""
     rng, board, shown = np.random.default_rng(seed), checkerboard(9, 7, 0.05), dict[str, Any]()
     places = board.point_array - board.point_array.mean(axis=0)
     while len(shown) < views:
@@ -80,7 +80,7 @@ def through_a_moving_pupil(seed: int, views: int) -> Observations:
 
 
 def phi_off(calibration: Calibration) -> float:
-    """In standard deviations."""
+    """Error in standard deviations."""
     verdict = calibration.uncertainty.verdict("camera", "camera", "phi")
     return (verdict.value - CAMERAS["camera"].phi) / verdict.sd
 
@@ -107,7 +107,9 @@ def test_principal_points_that_move_are_found_and_named(moving: list[tuple[Obser
 
 @pytest.mark.parametrize("seed", partly([1, 11], [11]))
 def test_rays_that_do_not_meet_in_one_point_are_no_principal_point_that_moves(seed: int) -> None:
-    """What was taken off for it, or for a rolling shutter, was the lens's: other views were predicted to 0.31, 0.92."""
+    """The lens's errors were attributed to it, or to a rolling shutter: other views were predicted
+    to 0.31 and 0.92 px.
+    """
     known, new = through_a_moving_pupil(seed, 10), through_a_moving_pupil(100 + seed, 12)
     assert not {one.kind for one in calibrate(known).effects} & {MOVES, ROLLING}
     lengths_px, kept = left_px(Options(), known, new)
@@ -135,7 +137,7 @@ def test_a_saved_calibration_is_diagnosed_beside_them(
 
 
 def test_what_is_taken_off_counts_from_the_first_round_on() -> None:
-    """Else the leverages found the noise larger than the count did, and asked for another round each time."""
+    """Otherwise the leverages gave a larger noise than the count, and each round asked for another one."""
     sights, options = gather_sights(shifted(0, 0.0)), Options(lens="radial")
     start = initialise(sights, options).estimate
     plain = problem_of(sights, options, start)
@@ -156,14 +158,14 @@ def test_a_rolling_shutter_is_found_and_named() -> None:
 
 @pytest.mark.thorough
 def test_what_is_taken_off_says_nothing_of_the_board() -> None:
-    """It follows what the board seemed to be: one as long as drawn was longer one way, at a probability of 1."""
+    """It depends on the board's estimate: a board as drawn was estimated as longer one way with probability 1."""
     bent = Board(views=VIEWS, points_m=2e-4, bow_m=1e-3, heights_m=3e-4)
     for seed in (10, 13):
         assert "stretch" not in {one.kind for one in calibrate(rolling(seed, 30.0, bent)).as_built}  # 5 of 16 before
 
 
 def test_too_few_equations_beside_the_views_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small boards leave none once each view has numbers of its own: what was found of the board stays as likely."""
+    """Small boards leave none if each view has its own numbers: findings about the board keep their probability."""
     asked = RepeatedAmounts.sizes
 
     def sizes(repeated: RepeatedAmounts, numbers: Any, priors: Any, stated: Any = ()) -> Any:
@@ -177,7 +179,7 @@ def test_too_few_equations_beside_the_views_change_nothing(monkeypatch: pytest.M
 
 @pytest.mark.thorough
 def test_pictures_of_two_cameras_are_no_stabilised_one(real_data: Path) -> None:
-    """A real stereo pair in one folder, 13 pictures each: their read-out seems to say most of what is left."""
+    """A real stereo pair in one folder, 13 pictures each: a read-out time seems to explain most of the residuals."""
     pictures = sorted((real_data / "opencv_left_right").glob("*.jpg"))
     both = detect_boards(pictures, checkerboard(9, 6, 0.025)).observations
     calibration = calibrate(both)

@@ -1,4 +1,4 @@
-"""One picture of several, and photographs out of videos: what moves is gone, what is blurred or bumped is named."""
+"""One picture from several, and photographs from videos: moving objects are removed, bad frames are named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIZE = (320, 240)
 
 
 def floor(shift_px: float = 0.0) -> Image:
-    """Lines on a carpet, all of it shifted."""
+    """Lines on a carpet, shifted as a whole."""
     grey = np.full((SIZE[1], SIZE[0]), 70, np.uint8)
     for x in (40.0, 160.0, 290.0):
         ends = [(round(256 * (x + shift_px)), round(256 * y)) for y in (10.0, 230.0)]
@@ -35,7 +35,7 @@ def floor(shift_px: float = 0.0) -> Image:
 
 
 def shot(seed: int, shift_px: float = 0.0, blur_px: float = 0.0, gain: float = 1.0) -> Image:
-    """The same with robots, which are elsewhere each time, a person at times, and noise."""
+    """The same with robots at other places each time, sometimes a person, and noise."""
     rng = np.random.default_rng(seed)
     grey = floor(shift_px)
     for x, y in rng.integers((10, 10), (310, 230), size=(8, 2)).tolist():
@@ -65,7 +65,7 @@ def test_what_moves_is_gone_and_what_is_blurred_or_bumped_is_left_out() -> None:
     assert one.left_out == (("blurred", "blurred"), ("bumped", moved), ("gone", moved))
     off = np.abs(one.picture - floor())
     assert np.mean(off) < 2.0 and np.mean(off > 30.0) < 1e-3  # 0.81 and 4e-5; a single shot has 3.2 and 0.02
-    assert len(np.unique(one.picture)) > 300  # finer than the levels of one
+    assert len(np.unique(one.picture)) > 300  # finer than the levels of one picture
 
 
 def test_a_camera_that_was_bumped_half_way_and_one_that_is_carried() -> None:
@@ -160,9 +160,9 @@ def test_a_board_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def turned(path: Path, source: Path) -> Path:
-    """A video whose header tells viewers to turn it by half a turn, as of a telephone that was held upside down."""
+    """A video whose header asks viewers to rotate it by 180 degrees, as of a telephone held upside down."""
     content = bytearray(source.read_bytes())
-    matrix = content.find(b"tkhd") + 4 + 40  # nine numbers of 32 bits, of 16 or 30 bits behind the point
+    matrix = content.find(b"tkhd") + 4 + 40  # nine fixed-point numbers of 32 bits, with 16 or 30 fractional bits
     struct.pack_into(">9i", content, matrix, -(1 << 16), 0, 0, 0, -(1 << 16), 0, 0, 0, 1 << 30)
     path.write_bytes(content)
     return path
@@ -204,7 +204,7 @@ def test_frames_are_as_the_sensor_stored_them_and_a_turn_for_viewers_is_said(
 
 
 def test_frames_of_two_videos_go_into_two_folders(tmp_path: Path) -> None:
-    """And into none that may hold photographs."""
+    """And not into a folder that may contain photographs."""
     one = write_video(tmp_path / "board.avi", [shot(1)])
     other = one.with_suffix(".mpg")
     with pytest.raises(InputError, match=r"board\.mpg: another video is called 'board', too: rename one"):

@@ -1,4 +1,4 @@
-"""Observations that Dask's workers keep: the same answer, whatever becomes of a worker."""
+"""Observations stored by Dask's workers: the same result, whatever happens to a worker."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def in_shares(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def cluster_client() -> Iterator[Any]:
-    """Of two workers, in processes of their own."""
+    """A client of two workers in their own processes."""
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
@@ -51,7 +51,7 @@ def cluster_client() -> Iterator[Any]:
 
 @pytest.fixture
 def client(cluster_client: Any) -> Any:
-    """With both workers, where a test before has killed some."""
+    """The client with both workers, where an earlier test has killed some."""
     cluster_client.wait_for_workers(2, timeout=60)
     return cluster_client
 
@@ -76,7 +76,7 @@ def test_workers_give_the_answer_of_one_process(client: Any, observations: Obser
 
 
 def _page_faults() -> int:
-    """Of ten arrays that are made one after the other where one has been."""
+    """Page faults of ten arrays that are allocated one after the other."""
     start = 0
     for number in range(11):
         np.ones(1 << 20)
@@ -155,16 +155,16 @@ def test_no_scheduler_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.thorough
 def test_workers_are_seen_while_the_client_polls(cluster_client: Any) -> None:
-    """What the client remembers of its scheduler names no worker for a moment after each of its polls."""
+    """For a moment after each poll, the client's information about its scheduler contains no worker."""
     often = dask.config.set({"distributed.client.scheduler-info-interval": "1ms"})
     with often, distributed.Client(cluster_client.cluster.scheduler_address) as polling:
         share: Any = "a share"
-        for _ in range(60):  # where its memory is asked, one in twelve finds no worker
+        for _ in range(60):  # by that information one in twelve finds no worker
             engines.OnWorkers(polling, [share]).close()
 
 
 def _kept_by(client: Any) -> int:
-    """Keys that workers hold once what was let go has gone."""
+    """Number of keys that workers hold after released ones are gone."""
     for _ in range(50):
         kept = sum(len(keys) for keys in client.has_what().values())
         if not kept:
@@ -174,7 +174,7 @@ def _kept_by(client: Any) -> int:
 
 
 def test_workers_that_keep_nothing_are_lost_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody is there to be asked, and nobody to be named."""
+    """No worker can be asked or named."""
 
     class DeadClient:
         scheduler = None
