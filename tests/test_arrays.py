@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ceres_cal.base.arrays import AnyArray, distinct, inverse_of, inverse_root_of, median, medians, quantile
+from ceres_cal.base.arrays import (
+    AnyArray,
+    distinct,
+    inverse_of,
+    inverse_root_of,
+    median,
+    medians,
+    quantile,
+    ridged_root_of,
+)
 
 AUTO = ["--target", "ssl-b", "--auto", "--facing", "LeftGoalLine=top"]
 SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field"
@@ -48,6 +57,15 @@ def test_inverses_by_halves_are_numpys(shape: tuple[int, ...]) -> None:
     for one in (inverse_of(matrix), np.swapaxes(half, -1, -2) @ half):
         assert np.allclose(one, inverse, rtol=1e-10, atol=1e-13)
     assert np.array_equal(half, np.tril(half))
+
+
+def test_a_ridged_root_takes_negative_eigenvalues_for_rounding() -> None:
+    """What a field of a few rejected clicks tells of its floor is rounding: a calibration "failed numerically"."""
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
+    for values, counted in (((3.0, 2.0, 1.0, 0.5),) * 2, ((3.0, 1.0, 0.0, -5e-7), (3.0, 1.0, 0.0, 0.0))):
+        root = ridged_root_of((turn * values) @ turn.T, 1e-7)
+        inverse = (turn / (np.array(counted) + 1e-7)) @ turn.T
+        assert np.allclose(root.T @ root, inverse, rtol=1e-6, atol=1e-6 * np.max(inverse))
 
 
 def test_they_import_no_masked_arrays() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,8 @@ from scenery import field_scene, overhead_pose
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import attempt
+from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -23,7 +25,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
-from ceres_cal.robust.noise import noise_of_cameras
+from ceres_cal.robust.camera_noise import _scale_of_few, noise_of_cameras
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
@@ -138,7 +140,7 @@ def test_a_camera_of_which_nothing_is_judged_has_no_noise_of_its_own() -> None:
     assert noise.get("c0", 1.0) in (1.0, calibration.fit.of_cameras["c0"])
 
 
-def clicked_beside_boards(seed: int) -> tuple[Observations, Camera]:
+def clicked_beside_boards(seed: int, count: int = 11, noise_px: float = 1.0) -> tuple[Observations, Camera]:
     """A field clicked to 1 px and boards detected to 0.1 px, both with sigma 1, and the camera that sees them."""
     rng, field, board, size = np.random.default_rng(seed), ssl_field("B"), checkerboard(9, 6, 0.1), (1280, 960)
     camera = Camera(
@@ -147,9 +149,9 @@ def clicked_beside_boards(seed: int) -> tuple[Observations, Camera]:
     places = np.array(list(field.points.values()))
     seen = camera.project(places)
     inside = np.all((seen > 5.0) & (seen < (1275.0, 955.0)), axis=1)
-    chosen = rng.permutation(np.flatnonzero(inside))[:11]
+    chosen = rng.permutation(np.flatnonzero(inside))[:count]
     clicks = np.full(seen.shape, np.nan)
-    clicks[chosen] = seen[chosen] + rng.normal(0.0, 1.0, (11, 2))
+    clicks[chosen] = seen[chosen] + rng.normal(0.0, noise_px, (count, 2))
     corners = np.array(list(board.points.values())) - (0.4, 0.25, 0.0)
     shown = {}
     for x in (-1.2, 0.0, 1.2):
@@ -165,14 +167,44 @@ def test_clicks_count_by_their_own_noise_beside_detected_boards() -> None:
     """With the noise of the boards the pose passed through four clicks, the others were outliers, and errors were up to
     6.1 times the 95 % radius.
     """
-    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 7), np.linspace(-1.0, 1.0, 5)))
     for seed in range(4):
         observations, camera = clicked_beside_boards(seed)
         calibration = calibrate(observations)
-        located = calibration.uncertainty.located(camera.project(np.column_stack([x, y, 0.0 * x])))
-        radii = np.linalg.norm(located.located - np.column_stack([x, y]), axis=1) / located.radius_95_m
-        assert np.max(radii) < 2.0, seed  # 1.1
+        assert np.max(radii_of(calibration, camera)) < 2.0, seed  # 1.1
         assert calibration.fit.of_cameras["camera/field"] > 3.0 and not calibration.outliers
+
+
+def radii_of(calibration: Calibration, camera: Camera) -> Array:
+    """How many of their 95 % radii places of the field are off."""
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 7), np.linspace(-1.0, 1.0, 5)))
+    located = calibration.uncertainty.located(camera.project(np.column_stack([x, y, 0.0 * x])))
+    radii: Array = np.linalg.norm(located.located - np.column_stack([x, y]), axis=1) / located.radius_95_m
+    return radii
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [4, 5, 6, 7])
+def test_few_clicks_beside_boards_say_how_little_is_known_of_their_noise(count: int) -> None:
+    every = []
+    for seed in range(24):
+        observations, camera = clicked_beside_boards(seed, count, (0.5, 1.0, 3.0)[seed % 3])
+        calibration = attempt(partial(calibrate, observations))
+        if isinstance(calibration, Calibration):  # clicks on one line are refused
+            every.append(radii_of(calibration, camera))
+    radii = np.array(every)
+    assert np.count_nonzero(np.max(radii, axis=1) > 3.0) <= 1  # 1, 0, 0, 0; by the likeliest noise alone 5, 1, 2, 2
+    assert np.mean(radii > 1.0) < 0.22  # 0.16, 0.09, 0.20, 0.09; by the likeliest noise alone 0.32, 0.20, 0.25, 0.24
+
+
+@pytest.mark.parametrize("freedom", [2.0, 6.0, 20.0])
+def test_a_scale_of_few_holds_what_it_says(freedom: float) -> None:
+    """Over the scales that are assumed to be, 95 % of normal errors are within 1.96 times the scale that is found."""
+    rng, runs = np.random.default_rng(0), 1000
+    scales = np.exp(np.clip(np.log(1.25) * rng.standard_cauchy(runs), -5.0, 5.0))
+    squares = scales**2 * rng.chisquare(freedom, runs)
+    found = np.array([_scale_of_few(one, freedom) for one in squares.tolist()])
+    inside = np.abs(scales * rng.standard_normal(runs)) < NORMAL_95 * found
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.02)  # standard error 0.007
 
 
 @pytest.mark.thorough

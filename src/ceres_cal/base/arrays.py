@@ -223,6 +223,17 @@ def inverse_root_of(matrix: Array) -> Array:
     return root
 
 
+def ridged_root_of(matrix: Array, ridge: float) -> Array:
+    """(n, n) root W for which W^T W is the inverse of a matrix plus `ridge` times the unit matrix; the matrix is
+    symmetric and positive semidefinite except for rounding.
+    """
+    lower = _unless_singular(inverse_root_of, matrix + ridge * np.eye(len(matrix)))
+    if lower is not None:
+        return lower
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, 0.0) + ridge)).T)
+
+
 def root_of(matrix: Array) -> Array:
     """(n, n) root with root^T root = matrix; the matrix is symmetric and positive semidefinite except for rounding."""
     lower = _unless_singular(np.linalg.cholesky, matrix)

@@ -93,6 +93,26 @@ def student_95(degrees_of_freedom: float) -> float:
     return z + sum(term / n**power for power, term in enumerate(terms, start=1))
 
 
+def mixture_95(weights: Array, variances: Array) -> float:
+    """Half width of the 95 % interval of a mixture of normal variables about 0."""
+
+    def beyond(width: float) -> float:
+        inside = [math.erf(width * math.sqrt(0.5 / variance)) for variance in variances.tolist()]
+        return float(weights @ inside) - 0.95
+
+    most = NORMAL_95 * math.sqrt(float(np.max(variances)))
+    return bisected(beyond, 0.0, most)
+
+
+def bisected(rising: Callable[[float], float], low: float, high: float) -> float:
+    """The place where a rising function changes its sign, by bisection; an end of the range where it does not."""
+    bisections = 50
+    for _ in range(bisections):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)
+    return 0.5 * (low + high)
+
+
 def log_chi2_tail(value: ArrayLike, freedom: ArrayLike) -> Array:
     """log P(chi-squared with `freedom` degrees of freedom > value)."""
     x, a = np.broadcast_arrays(0.5 * np.asarray(value, dtype=float), 0.5 * np.asarray(freedom, dtype=float))

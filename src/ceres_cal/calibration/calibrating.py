@@ -30,8 +30,8 @@ from ceres_cal.problem import (
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import freed, loosely
 from ceres_cal.robust.as_built import Construction, free_dimensions
+from ceres_cal.robust.camera_noise import noise_of_cameras
 from ceres_cal.robust.conflicts import contradicted_by
-from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise

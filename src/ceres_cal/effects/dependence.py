@@ -16,13 +16,14 @@ show whether there is any correlation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, numbers_of, replace, student_95, two_digits
+from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, numbers_of, replace, two_digits
+from ceres_cal.base.tails import bisected, mixture_95, student_95
 from ceres_cal.effects.columns import SparseColumns, places_in_view, smooth_image, smooth_view
 from ceres_cal.effects.evidence import DEPENDENCE, LENS_LEAVES, LIKELY, READ_OUT, SMOOTH_ERRORS, RepeatedAmounts
 from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
@@ -44,7 +45,7 @@ from ceres_cal.problem import Estimate, Information, Problem, ReducedInformation
 if TYPE_CHECKING:
     from ceres_cal.effects.likelihood import Likelihoods
 
-_INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that count as infinite; steps of a bisection
+_INDEFINITE = 1e6  # degrees of freedom that count as infinite
 
 
 class Correlation(Frozen, eq=True):
@@ -184,22 +185,8 @@ def _freedom_of_mixture(weights: Array, variances: Array) -> float:
     """Degrees of freedom for which Student's t has the 95 % interval of a mixture of normals of these variances, if
     both have the same mean variance.
     """
-    mean = float(weights @ variances)
-
-    def beyond(width: float) -> float:
-        inside = [math.erf(width * math.sqrt(0.5 * mean / v)) for v in variances.tolist()]
-        return 0.05 - (1.0 - float(weights @ inside))
-
-    width = _root_of(beyond, 1.0, 12.0)
-    return math.exp(_root_of(lambda log: width - student_95(math.exp(log)), 0.0, math.log(_INDEFINITE)))
-
-
-def _root_of(rising: Callable[[float], float], low: float, high: float) -> float:
-    """The place where a rising function changes its sign, by bisection; an end of the range where it does not."""
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)
-    return 0.5 * (low + high)
+    width = mixture_95(weights, variances / float(weights @ variances))
+    return math.exp(bisected(lambda log: width - student_95(math.exp(log)), 0.0, math.log(_INDEFINITE)))
 
 
 # Share of the largest variance of a score below which it is rounding. For a direction that only priors know it was

@@ -29,7 +29,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, inverse_of, inverse_root_of, median, replace
+from ceres_cal.base import Array, Frozen, Indices, inverse_of, median, replace, ridged_root_of
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
@@ -278,10 +278,9 @@ class RepeatedAmounts(Frozen):
         parts = int(part.max()) + 1
         information, score, in_shared = columns.left_of(model)
         rounding = 1e-12  # share of the columns' squares that is left by rounding where everything is projected out
-        ridge = _DETERMINED * float(np.max(np.diagonal(information), initial=0.0)) + rounding * float(
-            np.sum(columns.values**2)
-        )
-        root = inverse_root_of(information + ridge * np.eye(columns.size))
+        ridge = _DETERMINED * float(np.max(np.diagonal(information), initial=0.0))
+        ridge += rounding * max(float(np.sum(columns.values**2)), 1.0)  # 1 where no observation that counts shows any
+        root = ridged_root_of(information, ridge)
         best = columns.at(root.T @ (root @ score))
         left = np.where(model.used, model.left_over - model.left_of_column(best), 0.0)
         spare = model.spare - columns.size + ridge * float(np.sum(root**2))

@@ -7,6 +7,7 @@ observations alone predict.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -15,7 +16,7 @@ from ceres_cal.base import Array, Frozen, Indices, Mask, replace
 from ceres_cal.effects.linearised import equation_weights, shared_columns, studentised
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Options, Problem, ReducedInformation, Weighting, from_placement
-from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths, residuals
+from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths
 
 if TYPE_CHECKING:
     from ceres_cal.problem.shares import Histogram
@@ -38,13 +39,14 @@ _TAIL = 0.02
 SAME = 4e-3
 # Least noise scale. The stated sigma is usually a third of a pixel, and no image is measured to better than a
 # thousandth of a pixel. With exact observations and a smaller scale, all prior knowledge is lost in rounding.
-_LEAST_SCALE = 3e-3
+LEAST_SCALE = 3e-3
 # Factor on the stated sigmas up to which noise counts as stated: sigmas are guessed to a tenth or two. Below 1 every
 # sound scene would be a finding; at 2.3, noise of twice the stated one is missed.
 LARGER = 1.15
 _BLOCK = 1 << 16  # lengths summed at once, so that intermediate arrays stay in the processor's cache
 _RAYLEIGH_MEDIAN = 1.177410022515474  # median length of a two-dimensional standard normal vector
 _NORMAL_MEDIAN = 0.674489750196082  # median absolute value of a standard normal variable
+_MEDIANS = _RAYLEIGH_MEDIAN, _NORMAL_MEDIAN
 
 
 Redundancy = tuple[float, float]
@@ -144,7 +146,7 @@ def median_scales(points: Array, curves: Array) -> tuple[float, float]:
 
 
 def _median_scale(lengths: Lengths, median_of_one: float) -> float:
-    return max(lengths.middle() / median_of_one, _LEAST_SCALE) if lengths.count else 1.0
+    return max(lengths.middle() / median_of_one, LEAST_SCALE) if lengths.count else 1.0
 
 
 def _middle(lengths: Array) -> float:
@@ -206,7 +208,8 @@ def noise_of(
         return NoiseScales(1.0, 1.0, options.reject_sigma, np.inf)
     floor = usual or (0.0, 0.0)
     spare_of_all = 2.0 * redundancy[0] * points.count + redundancy[1] * curves.count
-    reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
+    known = spare_of_all + (USUAL_EQUATIONS if usual else 0.0)
+    reject_sigma = options.reject_sigma if known < _LEAST_SPARE else _as_rare(options.reject_sigma, known)
     p_sums = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy[0])
     c_sums = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy[1])
     spare = 2.0 * redundancy[0] * p_sums[0], redundancy[1] * c_sums[0]
@@ -223,12 +226,10 @@ def noise_of(
 
 def _as_rare(sigmas: float, degrees: float) -> float:
     """The bound that is as rare at a scale estimated with these degrees of freedom as `sigmas` is at a known scale: (1
-    + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), Student's t in two dimensions. It is `sigmas` where the
-    stated sigmas are taken.
+    + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), Student's t in two dimensions.
     """
     beyond = 100.0  # exponent: no observation is so rare
-    if degrees < _LEAST_SPARE:
-        return sigmas
+    degrees = max(degrees, 1.0)
     return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
@@ -240,7 +241,7 @@ def _scale(sums: _Sums, spare: float, other: _Sums, other_spare: float) -> float
     """The noise scale of a kind from its sums and degrees of freedom; the other kind counts for up to `_BORROWED`."""
     borrowed = min(_BORROWED, max(other_spare, 0.0))
     variance = borrowed * other[1] / max(other_spare, 1.0)
-    return max(float(np.sqrt((sums[1] + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE)
+    return max(float(np.sqrt((sums[1] + variance) / max(spare + borrowed, 1.0))), LEAST_SCALE)
 
 
 def _scale_from(usual: float, sums: _Sums, spare: float) -> float:
@@ -296,45 +297,26 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
     return spread
 
 
-def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict[str, float]:
-    """The noise of each name in `Observations.noise_names`, as a factor on the stated sigmas of its observations;
-    unchanged where all are about equally noisy.
+def squares_beside(lengths: Sequence[Array], taken_up: float, reject_sigma: float) -> tuple[float, float]:
+    """Sum of squares of some lengths of points and of curves without outliers, and their degrees of freedom.
 
-    The noise differs, for example, in a photograph out of focus, in a camera of fewer pixels or with another detector,
-    or in a field that was clicked beside boards that were detected. At the mean noise, the noisiest would seem too
-    certain and the others too uncertain. With few observations the mean counts as much as in `judge`. The unknowns of a
-    camera are divided among its observations by number of equations, those of a pose among the observations that show
-    it. As many of the shortest residuals are left out: a pose may go through some of few clicks, and the others would
-    then seem to be outliers (Rousseeuw and Leroy 1987, Robust Regression and Outlier Detection, 3.4).
+    A pose may go through some of few clicks, and the others would then seem to be outliers. So as many of the shortest
+    lengths have no part in the scale by which outliers are told (Rousseeuw and Leroy 1987, Robust Regression and
+    Outlier Detection, 3.4).
 
     Args:
-        problem: weighted by the noise of all together. judged: (N + M,) observations that are not known outliers.
+        taken_up: share of their equations that unknowns take up. reject_sigma: the outliers' bound at a known scale.
     """
-    alike = 1.25  # ratio of noise scales up to which sds are right, as far as hundreds of runs can tell
-    by_chance = 3.0  # standard errors of a scale up to which a difference counts as chance
-    observations, layout, usual = problem.observations, problem.layout, problem.weighting.scales
-    lengths = relative_lengths(observations, residuals(problem.sights, estimate, problem.feet))
-    kinds, columns = np.split(judged, [len(observations.points)]), (observations.points, observations.curves)
-    owners, noise, differ = np.array(observations.noise_names), dict[str, float](), False
-    seen = {str(name): [observations.views[row] for row in np.flatnonzero(owners == name)] for name in owners}
-    rows = {name: [own & (owners == name)[c.view] for own, c in zip(kinds, columns, strict=True)] for name in seen}
-    each = {name: [at[own & np.isfinite(at)] for at, own in zip(lengths, rows[name], strict=True)] for name in seen}
-    counts = {name: (2 * len(points), len(curves)) for name, (points, curves) in each.items()}
-    for name, views in seen.items():
-        if not any(counts[name]):  # all of its observations are left out, or cannot be shown
-            continue
-        camera, equations = views[0].camera, sum(counts[name])
-        of_camera = sum(sum(counts[other]) for other, shown in seen.items() if shown[0].camera == camera)
-        poses = len(layout.stations & {view.station for view in views})
-        poses += len(layout.placements & {view.placement for view in views})
-        taken_up = min(len(layout.free.get(camera, ())) / of_camera + 6 * poses / equations, 1.0)
-        points, curves = (EachLength(np.sort(one)[int(taken_up * len(one)) :]) for one in each[name])
-        found = noise_of(points, curves, (1.0, 1.0), problem.options, usual)
-        ratios = np.maximum(found[:2], _LEAST_SCALE) / usual
-        ratio = float(np.sqrt(np.average(ratios**2, weights=counts[name])))
-        differ |= abs(np.log(ratio)) > max(np.log(alike), by_chance / (2.0 * found.degrees_of_freedom) ** 0.5)
-        noise[name] = ratio * observations.noise.get(name, 1.0)
-    return noise if differ else dict(observations.noise)
+    firsts = [int(taken_up * len(one)) for one in lengths]
+    each = (2.0, 1.0)  # equations
+    spare = sum(e * (len(one) - first) for e, one, first in zip(each, lengths, firsts, strict=True))
+    bound = _as_rare(reject_sigma, spare)
+    squares = freedom = 0.0
+    for one, first, median, e in zip(lengths, firsts, _MEDIANS, each, strict=True):
+        ordered = np.sort(one)
+        count, longest = _spread(EachLength(ordered[first:]), median, bound, 0.0, e)
+        squares, freedom = squares + longest + float(ordered[:first] @ ordered[:first]), freedom + e * count
+    return squares, freedom
 
 
 # ---- outliers by deleted residuals ----------------------------------------------------------------------------------
