@@ -1,16 +1,143 @@
 from ceres_cal.base import words as words
-from ceres_cal.base.archives import *
-from ceres_cal.base.arrays import *
-from ceres_cal.base.errors import *
-from ceres_cal.base.executing import *
-from ceres_cal.base.files import *
-from ceres_cal.base.frozen import *
-from ceres_cal.base.images import *
-from ceres_cal.base.shown import *
-from ceres_cal.base.tails import *
-from ceres_cal.base.threads import *
-from ceres_cal.base.transforms import *
-from ceres_cal.base.typed import *
-from ceres_cal.base.words import *
+from ceres_cal.base.archives import Column as Column
+from ceres_cal.base.archives import read_foreign_npz as read_foreign_npz
+from ceres_cal.base.archives import read_npz as read_npz
+from ceres_cal.base.archives import require_columns as require_columns
+from ceres_cal.base.arrays import NOTHING as NOTHING
+from ceres_cal.base.arrays import AnyArray as AnyArray
+from ceres_cal.base.arrays import Array as Array
+from ceres_cal.base.arrays import Array32 as Array32
+from ceres_cal.base.arrays import Codes as Codes
+from ceres_cal.base.arrays import Image as Image
+from ceres_cal.base.arrays import Image8 as Image8
+from ceres_cal.base.arrays import Indices as Indices
+from ceres_cal.base.arrays import Indices32 as Indices32
+from ceres_cal.base.arrays import Mask as Mask
+from ceres_cal.base.arrays import Spread as Spread
+from ceres_cal.base.arrays import are_known as are_known
+from ceres_cal.base.arrays import distinct as distinct
+from ceres_cal.base.arrays import dots as dots
+from ceres_cal.base.arrays import evenly as evenly
+from ceres_cal.base.arrays import grid_places as grid_places
+from ceres_cal.base.arrays import inverse_of as inverse_of
+from ceres_cal.base.arrays import inverse_root_of as inverse_root_of
+from ceres_cal.base.arrays import is_diagonal as is_diagonal
+from ceres_cal.base.arrays import known_inverses as known_inverses
+from ceres_cal.base.arrays import largest as largest
+from ceres_cal.base.arrays import median as median
+from ceres_cal.base.arrays import medians as medians
+from ceres_cal.base.arrays import medians_known as medians_known
+from ceres_cal.base.arrays import numbers_of as numbers_of
+from ceres_cal.base.arrays import numerical as numerical
+from ceres_cal.base.arrays import quantile as quantile
+from ceres_cal.base.arrays import rms as rms
+from ceres_cal.base.arrays import rms_and_largest as rms_and_largest
+from ceres_cal.base.arrays import root_of as root_of
+from ceres_cal.base.arrays import thin_root as thin_root
+from ceres_cal.base.arrays import without as without
+from ceres_cal.base.errors import CalibrationError as CalibrationError
+from ceres_cal.base.errors import DegenerateError as DegenerateError
+from ceres_cal.base.errors import ImageProgress as ImageProgress
+from ceres_cal.base.errors import InputError as InputError
+from ceres_cal.base.errors import NothingShownError as NothingShownError
+from ceres_cal.base.errors import SolutionError as SolutionError
+from ceres_cal.base.errors import StepProgress as StepProgress
+from ceres_cal.base.errors import answer_or_reason as answer_or_reason
+from ceres_cal.base.errors import attempt as attempt
+from ceres_cal.base.errors import naming as naming
+from ceres_cal.base.errors import note as note
+from ceres_cal.base.errors import noted_words as noted_words
+from ceres_cal.base.errors import noting as noting
+from ceres_cal.base.errors import or_none as or_none
+from ceres_cal.base.executing import each as each
+from ceres_cal.base.executing import processes as processes
+from ceres_cal.base.files import PixelOrigin as PixelOrigin
+from ceres_cal.base.files import Units as Units
+from ceres_cal.base.files import body_of as body_of
+from ceres_cal.base.files import convert as convert
+from ceres_cal.base.files import json_text as json_text
+from ceres_cal.base.files import make_folder as make_folder
+from ceres_cal.base.files import most_bytes as most_bytes
+from ceres_cal.base.files import parse_json as parse_json
+from ceres_cal.base.files import read_bytes as read_bytes
+from ceres_cal.base.files import read_json as read_json
+from ceres_cal.base.files import require_room as require_room
+from ceres_cal.base.files import write_bytes as write_bytes
+from ceres_cal.base.files import write_json as write_json
+from ceres_cal.base.frozen import Frozen as Frozen
+from ceres_cal.base.frozen import LazyTable as LazyTable
+from ceres_cal.base.frozen import Rows as Rows
+from ceres_cal.base.frozen import cached_property as cached_property
+from ceres_cal.base.frozen import field as field
+from ceres_cal.base.frozen import names_of as names_of
+from ceres_cal.base.frozen import replace as replace
+from ceres_cal.base.images import IMAGE_ENDINGS as IMAGE_ENDINGS
+from ceres_cal.base.images import VIDEO_ENDINGS as VIDEO_ENDINGS
+from ceres_cal.base.images import Images as Images
+from ceres_cal.base.images import each_camera as each_camera
+from ceres_cal.base.images import image_files as image_files
+from ceres_cal.base.images import images_and_videos as images_and_videos
+from ceres_cal.base.shown import Shown as Shown
+from ceres_cal.base.shown import brief as brief
+from ceres_cal.base.shown import drawn as drawn
+from ceres_cal.base.shown import html_of as html_of
+from ceres_cal.base.shown import text_of as text_of
+from ceres_cal.base.tails import NORMAL_95 as NORMAL_95
+from ceres_cal.base.tails import NORMAL_95_ONE_SIDED as NORMAL_95_ONE_SIDED
+from ceres_cal.base.tails import log_binomial_tail as log_binomial_tail
+from ceres_cal.base.tails import log_chi2_tail as log_chi2_tail
+from ceres_cal.base.tails import log_f_tail as log_f_tail
+from ceres_cal.base.tails import student_95 as student_95
+from ceres_cal.base.tails import tail_root as tail_root
+from ceres_cal.base.tails import upper_tail as upper_tail
+from ceres_cal.base.threads import at_most as at_most
+from ceres_cal.base.threads import available as available
+from ceres_cal.base.threads import for_small_matrices as for_small_matrices
+from ceres_cal.base.threads import interruptibly as interruptibly
+from ceres_cal.base.threads import kept_signals as kept_signals
+from ceres_cal.base.threads import meanwhile as meanwhile
+from ceres_cal.base.threads import parts_of as parts_of
+from ceres_cal.base.threads import run_parts as run_parts
+from ceres_cal.base.transforms import Pose as Pose
+from ceres_cal.base.transforms import Poses as Poses
+from ceres_cal.base.transforms import chained as chained
+from ceres_cal.base.transforms import euler_from_rotation as euler_from_rotation
+from ceres_cal.base.transforms import inverted as inverted
+from ceres_cal.base.transforms import left_jacobian as left_jacobian
+from ceres_cal.base.transforms import nearest_rotation as nearest_rotation
+from ceres_cal.base.transforms import quaternion as quaternion
+from ceres_cal.base.transforms import require_rotation as require_rotation
+from ceres_cal.base.transforms import rotation_exp as rotation_exp
+from ceres_cal.base.transforms import rotation_log as rotation_log
+from ceres_cal.base.transforms import rotation_of as rotation_of
+from ceres_cal.base.transforms import skew as skew
+from ceres_cal.base.transforms import skews as skews
+from ceres_cal.base.typed import checked as checked
+from ceres_cal.base.typed import numbers_in as numbers_in
+from ceres_cal.base.typed import rows as rows
+from ceres_cal.base.typed import size_in as size_in
+from ceres_cal.base.typed import take_types as take_types
+from ceres_cal.base.words import DASH as DASH
+from ceres_cal.base.words import HEIGHTS_M as HEIGHTS_M
+from ceres_cal.base.words import IN_A_METRE as IN_A_METRE
+from ceres_cal.base.words import ROBOT_TOP_M as ROBOT_TOP_M
+from ceres_cal.base.words import at_height as at_height
+from ceres_cal.base.words import bounds_text as bounds_text
+from ceres_cal.base.words import counted as counted
+from ceres_cal.base.words import did_you_mean as did_you_mean
+from ceres_cal.base.words import ended as ended
+from ceres_cal.base.words import finite as finite
+from ceres_cal.base.words import first_of as first_of
+from ceres_cal.base.words import fixed as fixed
+from ceres_cal.base.words import frame_of as frame_of
+from ceres_cal.base.words import grouped as grouped
+from ceres_cal.base.words import mm as mm
+from ceres_cal.base.words import no_such as no_such
+from ceres_cal.base.words import plural as plural
+from ceres_cal.base.words import powered as powered
+from ceres_cal.base.words import printable as printable
+from ceres_cal.base.words import sentence as sentence
+from ceres_cal.base.words import short as short
+from ceres_cal.base.words import two_digits as two_digits
 
 __version__: str

@@ -1,11 +1,30 @@
 from ceres_cal.effects import aside as aside
-from ceres_cal.effects.aside import *
-from ceres_cal.effects.columns import *
-from ceres_cal.effects.dependence import *
-from ceres_cal.effects.effect import *
-from ceres_cal.effects.evidence import *
-from ceres_cal.effects.groups import *
-from ceres_cal.effects.likelihood import *
-from ceres_cal.effects.linearised import *
-from ceres_cal.effects.smoothness import *
-from ceres_cal.effects.strands import *
+from ceres_cal.effects.aside import Explanation as Explanation
+from ceres_cal.effects.columns import EffectSums as EffectSums
+from ceres_cal.effects.columns import Selection as Selection
+from ceres_cal.effects.columns import SparseColumns as SparseColumns
+from ceres_cal.effects.columns import least_absolute as least_absolute
+from ceres_cal.effects.columns import places_in_view as places_in_view
+from ceres_cal.effects.columns import select as select
+from ceres_cal.effects.columns import smooth_image as smooth_image
+from ceres_cal.effects.columns import smooth_view as smooth_view
+from ceres_cal.effects.dependence import Scatter as Scatter
+from ceres_cal.effects.effect import Amount as Amount
+from ceres_cal.effects.effect import AsBuilt as AsBuilt
+from ceres_cal.effects.effect import Case as Case
+from ceres_cal.effects.effect import EffectEstimate as EffectEstimate
+from ceres_cal.effects.effect import Finding as Finding
+from ceres_cal.effects.effect import ShiftsAt as ShiftsAt
+from ceres_cal.effects.effect import Words as Words
+from ceres_cal.effects.evidence import FLOOR_OFF as FLOOR_OFF
+from ceres_cal.effects.evidence import LIKELY as LIKELY
+from ceres_cal.effects.evidence import RepeatedAmounts as RepeatedAmounts
+from ceres_cal.effects.evidence import shifts_by as shifts_by
+from ceres_cal.effects.groups import posed as posed
+from ceres_cal.effects.linearised import Linearised as Linearised
+from ceres_cal.effects.linearised import Weights as Weights
+from ceres_cal.effects.linearised import equation_weights as equation_weights
+from ceres_cal.effects.linearised import linearise_within as linearise_within
+from ceres_cal.effects.linearised import make_linear_model as make_linear_model
+from ceres_cal.effects.smoothness import likeliest_sizes as likeliest_sizes
+from ceres_cal.effects.strands import strand_names as strand_names

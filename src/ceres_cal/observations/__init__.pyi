@@ -1,7 +1,32 @@
 from ceres_cal.observations import columns as columns
 from ceres_cal.observations import same_frame as same_frame
-from ceres_cal.observations.columns import *
+from ceres_cal.observations.columns import COMA as COMA
+from ceres_cal.observations.columns import NO_CURVES as NO_CURVES
+from ceres_cal.observations.columns import NO_POINTS as NO_POINTS
+from ceres_cal.observations.columns import Columns as Columns
+from ceres_cal.observations.columns import Curves as Curves
+from ceres_cal.observations.columns import FileRows as FileRows
+from ceres_cal.observations.columns import Points as Points
+from ceres_cal.observations.columns import Prior as Prior
+from ceres_cal.observations.columns import View as View
+from ceres_cal.observations.columns import joined as joined
+from ceres_cal.observations.columns import prior_from_json as prior_from_json
+from ceres_cal.observations.columns import prior_to_json as prior_to_json
+from ceres_cal.observations.columns import read_rows as read_rows
+from ceres_cal.observations.columns import rows_of as rows_of
+from ceres_cal.observations.columns import taken as taken
 from ceres_cal.observations.files import FORMAT as FORMAT
 from ceres_cal.observations.files import VERSION as VERSION
-from ceres_cal.observations.observations import *
-from ceres_cal.observations.sights import *
+from ceres_cal.observations.observations import Observations as Observations
+from ceres_cal.observations.observations import combine as combine
+from ceres_cal.observations.sights import Owner as Owner
+from ceres_cal.observations.sights import SightKey as SightKey
+from ceres_cal.observations.sights import Sights as Sights
+from ceres_cal.observations.sights import bounds_of as bounds_of
+from ceres_cal.observations.sights import column_of as column_of
+from ceres_cal.observations.sights import gather_sights as gather_sights
+from ceres_cal.observations.sights import is_bulk as is_bulk
+from ceres_cal.observations.sights import ranges as ranges
+from ceres_cal.observations.sights import shown_rows as shown_rows
+from ceres_cal.observations.sights import some_views as some_views
+from ceres_cal.observations.sights import thinned as thinned

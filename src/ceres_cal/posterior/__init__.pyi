@@ -1,10 +1,16 @@
 from ceres_cal.posterior.assess import with_doubts as with_doubts
 from ceres_cal.posterior.assess import with_other_lenses as with_other_lenses
-from ceres_cal.posterior.bent import *
-from ceres_cal.posterior.files import *
-from ceres_cal.posterior.maps import *
-from ceres_cal.posterior.mixture import *
-from ceres_cal.posterior.other_lenses import *
-from ceres_cal.posterior.posterior import *
-from ceres_cal.posterior.seam import *
-from ceres_cal.posterior.uncertainty import *
+from ceres_cal.posterior.maps import ErrorMap as ErrorMap
+from ceres_cal.posterior.maps import FieldGrid as FieldGrid
+from ceres_cal.posterior.maps import FieldMap as FieldMap
+from ceres_cal.posterior.maps import ImageMap as ImageMap
+from ceres_cal.posterior.maps import field_map as field_map
+from ceres_cal.posterior.maps import locate_slopes as locate_slopes
+from ceres_cal.posterior.maps import station_keys as station_keys
+from ceres_cal.posterior.maps import visible_pixels as visible_pixels
+from ceres_cal.posterior.mixture import Mixture as Mixture
+from ceres_cal.posterior.other_lenses import OtherLenses as OtherLenses
+from ceres_cal.posterior.posterior import Posterior as Posterior
+from ceres_cal.posterior.uncertainty import Uncertainty as Uncertainty
+from ceres_cal.posterior.uncertainty import Verdict as Verdict
+from ceres_cal.posterior.uncertainty import field_grid as field_grid

@@ -1,11 +1,53 @@
-from ceres_cal.problem.bundle import *
-from ceres_cal.problem.costs import *
-from ceres_cal.problem.engines import *
-from ceres_cal.problem.information import *
-from ceres_cal.problem.parameters import *
-from ceres_cal.problem.priors import *
-from ceres_cal.problem.problem import *
-from ceres_cal.problem.quantities import *
+from ceres_cal.problem.bundle import Progress as Progress
+from ceres_cal.problem.bundle import Solution as Solution
+from ceres_cal.problem.bundle import SolveProgress as SolveProgress
+from ceres_cal.problem.bundle import placement_costs as placement_costs
+from ceres_cal.problem.bundle import solve as solve
+from ceres_cal.problem.bundle import with_placements_at_best as with_placements_at_best
+from ceres_cal.problem.costs import robust_weights as robust_weights
+from ceres_cal.problem.information import PLACEMENT_QUANTITIES as PLACEMENT_QUANTITIES
+from ceres_cal.problem.information import Information as Information
+from ceres_cal.problem.information import Key as Key
+from ceres_cal.problem.information import columns_by_owner as columns_by_owner
+from ceres_cal.problem.information import over as over
+from ceres_cal.problem.information import pose_keys as pose_keys
+from ceres_cal.problem.information import sigma_limits as sigma_limits
+from ceres_cal.problem.parameters import OF_PIXELS as OF_PIXELS
+from ceres_cal.problem.parameters import Estimate as Estimate
+from ceres_cal.problem.parameters import Layout as Layout
+from ceres_cal.problem.parameters import Options as Options
+from ceres_cal.problem.parameters import Station as Station
+from ceres_cal.problem.parameters import intrinsic_names as intrinsic_names
+from ceres_cal.problem.parameters import intrinsics_vector as intrinsics_vector
+from ceres_cal.problem.parameters import make_layout as make_layout
+from ceres_cal.problem.parameters import unit_px as unit_px
+from ceres_cal.problem.parameters import with_intrinsics as with_intrinsics
+from ceres_cal.problem.priors import ANY_PHI as ANY_PHI
+from ceres_cal.problem.priors import USUAL_DECENTRING as USUAL_DECENTRING
+from ceres_cal.problem.priors import GaussianPrior as GaussianPrior
+from ceres_cal.problem.priors import gather_priors as gather_priors
+from ceres_cal.problem.priors import stated_prior as stated_prior
+from ceres_cal.problem.priors import tolerances as tolerances
+from ceres_cal.problem.problem import Problem as Problem
+from ceres_cal.problem.problem import Weighting as Weighting
+from ceres_cal.problem.problem import problem_of as problem_of
+from ceres_cal.problem.quantities import PHI_RANGE as PHI_RANGE
+from ceres_cal.problem.quantities import PixelSlopes as PixelSlopes
+from ceres_cal.problem.quantities import camera_ranges as camera_ranges
+from ceres_cal.problem.quantities import difference as difference
+from ceres_cal.problem.quantities import every_key as every_key
+from ceres_cal.problem.quantities import floor_of as floor_of
+from ceres_cal.problem.quantities import free_keys as free_keys
+from ceres_cal.problem.quantities import from_placement as from_placement
+from ceres_cal.problem.quantities import intrinsic_keys as intrinsic_keys
+from ceres_cal.problem.quantities import is_lens as is_lens
+from ceres_cal.problem.quantities import layout_of as layout_of
+from ceres_cal.problem.quantities import moved as moved
+from ceres_cal.problem.quantities import natural_sizes as natural_sizes
+from ceres_cal.problem.quantities import pixel_slopes as pixel_slopes
+from ceres_cal.problem.quantities import place_ranges as place_ranges
+from ceres_cal.problem.quantities import require_possible_numbers as require_possible_numbers
+from ceres_cal.problem.quantities import values_of as values_of
 from ceres_cal.problem.reduced import ReducedInformation as ReducedInformation
 from ceres_cal.problem.residuals import Equations as Equations
 from ceres_cal.problem.residuals import Residuals as Residuals
@@ -14,7 +56,13 @@ from ceres_cal.problem.residuals import equations_of as equations_of
 from ceres_cal.problem.residuals import relative_lengths as relative_lengths
 from ceres_cal.problem.residuals import whole_structure as whole_structure
 from ceres_cal.problem.residuals import write_equations as write_equations
-from ceres_cal.problem.shares import *
-from ceres_cal.problem.structure import *
+from ceres_cal.problem.structure import EXACT as EXACT
+from ceres_cal.problem.structure import Kind as Kind
+from ceres_cal.problem.structure import Structure as Structure
+from ceres_cal.problem.structure import Tolerance as Tolerance
+from ceres_cal.problem.structure import dimension_slopes as dimension_slopes
+from ceres_cal.problem.structure import dimensions_of as dimensions_of
+from ceres_cal.problem.structure import make_structure as make_structure
+from ceres_cal.problem.structure import redrawn as redrawn
 
 solver_version: str

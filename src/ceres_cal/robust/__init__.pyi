@@ -1,11 +1,8 @@
-from ceres_cal.robust.as_built import *
-from ceres_cal.robust.bulk import *
-from ceres_cal.robust.competing import *
-from ceres_cal.robust.conflicts import *
-from ceres_cal.robust.effects import *
-from ceres_cal.robust.noise import *
-from ceres_cal.robust.other_minima import *
-from ceres_cal.robust.robust import *
-from ceres_cal.robust.stated import *
-from ceres_cal.robust.unsteady import *
-from ceres_cal.robust.usable import *
+from ceres_cal.robust.conflicts import Conflicts as Conflicts
+from ceres_cal.robust.noise import USUAL_EQUATIONS as USUAL_EQUATIONS
+from ceres_cal.robust.noise import Inliers as Inliers
+from ceres_cal.robust.noise import judge as judge
+from ceres_cal.robust.other_minima import minima_of as minima_of
+from ceres_cal.robust.other_minima import with_lost_boards_posed as with_lost_boards_posed
+from ceres_cal.robust.robust import RobustSolution as RobustSolution
+from ceres_cal.robust.stated import Conflict as Conflict

@@ -1,9 +1,52 @@
-from ceres_cal.scene.camera import *
-from ceres_cal.scene.curves import *
-from ceres_cal.scene.foreign import *
+from ceres_cal.scene.camera import LARGEST as LARGEST
+from ceres_cal.scene.camera import Camera as Camera
+from ceres_cal.scene.camera import CameraFile as CameraFile
+from ceres_cal.scene.camera import Matrix as Matrix
+from ceres_cal.scene.camera import PoseFile as PoseFile
+from ceres_cal.scene.camera import Vector as Vector
+from ceres_cal.scene.camera import camera_to_json as camera_to_json
+from ceres_cal.scene.camera import in_image as in_image
+from ceres_cal.scene.curves import along_curve as along_curve
+from ceres_cal.scene.curves import along_track as along_track
+from ceres_cal.scene.curves import crossings as crossings
+from ceres_cal.scene.curves import curve_points as curve_points
+from ceres_cal.scene.curves import distance_to_curve as distance_to_curve
+from ceres_cal.scene.curves import is_crossing as is_crossing
+from ceres_cal.scene.curves import nearest_on_curve as nearest_on_curve
+from ceres_cal.scene.curves import nearest_on_track as nearest_on_track
+from ceres_cal.scene.curves import nearest_to_rays as nearest_to_rays
+from ceres_cal.scene.curves import turned_on as turned_on
+from ceres_cal.scene.foreign import FISHEYE as FISHEYE
+from ceres_cal.scene.foreign import ForeignCamera as ForeignCamera
+from ceres_cal.scene.foreign import image_grid as image_grid
+from ceres_cal.scene.foreign import nearest as nearest
+from ceres_cal.scene.foreign import opencv_models as opencv_models
 from ceres_cal.scene.lens import LENSES as LENSES
 from ceres_cal.scene.lens import Lens as Lens
 from ceres_cal.scene.lens import Radial as Radial
 from ceres_cal.scene.lens import make_lens as make_lens
-from ceres_cal.scene.symmetry import *
-from ceres_cal.scene.targets import *
+from ceres_cal.scene.symmetry import TURNED as TURNED
+from ceres_cal.scene.symmetry import counterparts as counterparts
+from ceres_cal.scene.symmetry import is_seen_turned as is_seen_turned
+from ceres_cal.scene.symmetry import middle_of as middle_of
+from ceres_cal.scene.symmetry import size_of as size_of
+from ceres_cal.scene.symmetry import turns_of as turns_of
+from ceres_cal.scene.targets import SIDES as SIDES
+from ceres_cal.scene.targets import TARGET_KINDS as TARGET_KINDS
+from ceres_cal.scene.targets import Arc as Arc
+from ceres_cal.scene.targets import Curve as Curve
+from ceres_cal.scene.targets import Segment as Segment
+from ceres_cal.scene.targets import Target as Target
+from ceres_cal.scene.targets import TargetKind as TargetKind
+from ceres_cal.scene.targets import april_grid as april_grid
+from ceres_cal.scene.targets import charuco as charuco
+from ceres_cal.scene.targets import checkerboard as checkerboard
+from ceres_cal.scene.targets import circle_grid as circle_grid
+from ceres_cal.scene.targets import custom as custom
+from ceres_cal.scene.targets import require_features as require_features
+from ceres_cal.scene.targets import ssl_field as ssl_field
+from ceres_cal.scene.targets import still as still
+from ceres_cal.scene.targets import target_from_spec as target_from_spec
+from ceres_cal.scene.targets import target_named as target_named
+from ceres_cal.scene.targets import targets_by_name as targets_by_name
+from ceres_cal.scene.targets import targets_from_specs as targets_from_specs
