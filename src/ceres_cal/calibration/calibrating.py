@@ -12,8 +12,6 @@ import numpy as np
 from ceres_cal.base import at_most, checked, counted, for_small_matrices, meanwhile, numerical, replace
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, SolutionError, attempt, or_none
 from ceres_cal.calibration import Calibration, LensChoice
-from ceres_cal.calibration.lens_forms import any_lens
-from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import of_closed_form
 from ceres_cal.calibration.solving import Task, TaskSolution, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
@@ -31,7 +29,6 @@ from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import freed, loosely
 from ceres_cal.robust.as_built import Construction, free_dimensions
 from ceres_cal.robust.camera_noise import noise_of_cameras
-from ceres_cal.robust.conflicts import contradicted_by
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
@@ -111,6 +108,8 @@ def _others_can(failure: CalibrationError, observations: Observations, options: 
 
 def lenses_by_held_out(observations: Observations, options: Options) -> Mapping[str, LensChoice]:
     """Return each camera's choice of the lens that best predicts held-out observations; the options' is ignored."""
+    from ceres_cal.calibration.lens_forms import any_lens
+
     return calibrate(observations, any_lens(options)).lens_choices
 
 
@@ -126,6 +125,8 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     Raises:
         CalibrationError: see `calibrate`.
     """
+    from ceres_cal.calibration.lens_seen import profiles_of, seen_through
+
     observations, options = free_dimensions(observations, options)
     sights, (name,), (station,) = gather_sights(observations), observations.cameras, observations.stations
     structure = make_structure(observations.targets, options.tolerances, options.dimensions)
@@ -345,6 +346,8 @@ def _from_there(free: Calibration, observations: Observations, options: Options)
     Raises:
         SolutionError: the observations contradict a statement, or no solution from that start agrees with all of them.
     """
+    from ceres_cal.robust.conflicts import contradicted_by
+
     stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior
     words = contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)

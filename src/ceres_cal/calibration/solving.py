@@ -45,11 +45,11 @@ from ceres_cal.robust.as_built import (
     tolerances_of,
 )
 from ceres_cal.robust.competing import Solver, Subproblem, compete
-from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.stated import Conflicts, statements
 from ceres_cal.robust.unsteady import ViewDisplacement, find_unsteady
-from ceres_cal.robust.usable import all_shown, misnamed, require_fits, require_possible, require_usable
+from ceres_cal.robust.usable import misnamed, require_fits, require_possible, require_usable, shows_all
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
 
@@ -246,11 +246,14 @@ def known_of(seen: TaskSolution) -> Calibration:
     task, conflicts = seen.task, Conflicts()
     before, seen = seen, seen.as_stated
     near = before.end if task.stated else None
-    if task.tested:
+    every = tuple(statements(seen.problem, seen.end.estimate)) if task.tested else ()
+    if every:
+        from ceres_cal.robust.conflicts import find_conflicts
+
         part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
         solver = partial(solve_held, partial(solve_robustly, usual=task.scales), every=seen.as_built)
-        conflicts = find_conflicts(seen.problem, seen.end, solver, part, seen.shifts_at, near)
-        seen = seen.without(conflicts).doubted_as(before)
+        conflicts = find_conflicts(every, seen.problem, seen.end, solver, part, seen.shifts_at, near)
+    seen = seen.without(conflicts).doubted_as(before)
     settled = None
     if task.settle is not None:
         settled = task.settle(seen.problem, seen.end, seen.explanations, task.progress)
@@ -419,7 +422,7 @@ def _as_long_as_asked(seen: TaskSolution) -> TaskSolution:
         try_of = problem_of(problem.sights, longer, near)
         # quiet: the lens without these terms stays; what it leaves is diagnosed
         found = attempt(lambda: solve_robustly(try_of, near, progress=seen.task.progress))
-        if isinstance(found, RobustSolution) and _shows_all(found):
+        if isinstance(found, RobustSolution) and shows_all(found):
             problem, end = _named(try_of), replace(found, problem=_named(found.problem))
     start = replace(seen.start, estimate=_seen_longer(seen.start.estimate, problem.options))
     return replace(seen, problem=problem, start=start, end=end)
@@ -441,10 +444,3 @@ def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
         # This only sets the lens's own span.
         cameras[name] = replace(camera, lens=lens.spanning(0.0, camera.phi, 1.0, camera.image_size))
     return replace(estimate, cameras=cameras)
-
-
-def _shows_all(end: RobustSolution) -> bool:
-    """Return whether no lens folds inside the observed part of the image."""
-    sights = end.problem.sights
-    cameras = end.estimate.cameras.items()
-    return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)

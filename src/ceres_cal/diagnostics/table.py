@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -121,6 +120,8 @@ class ResidualTable(Frozen):
             plain = {name: _plain(column) for name, column in columns.items()}
             write_json(path, {"format": format, "version": version, "columns": plain})
         else:
+            import csv
+
             text = io.StringIO(newline="")
             writer = csv.writer(text, lineterminator="\n")
             writer.writerow(columns)

@@ -40,6 +40,8 @@ from ceres_cal.robust.stated import (
     DOUBTED,
     LEVEL,
     Conflict,
+    Conflicts,
+    Doubt,
     Statement,
     WaldTest,
     agreed,
@@ -48,7 +50,6 @@ from ceres_cal.robust.stated import (
     doubted,
     grouped,
     likely_wrong,
-    statements,
     together,
 )
 
@@ -189,39 +190,9 @@ _SUSPICIOUS = 0.028
 _RIVAL = 0.6  # share of the largest squared distance above which another statement may be the wrong one instead
 
 
-class Conflicts(Frozen):
-    """The statements that are contradicted, and how the numbers move without each of them.
-
-    Attributes:
-        every: the conflicts. shifts: (K,) each, over the shared keys (K): by how much the numbers move when statements
-            in conflict are left out, or when they are kept.
-        answer: the solution without contradicted statements; None where the answer stays.
-        doubts: priors that look wrong but are too likely right to be set aside.
-    """
-
-    every: tuple[Conflict, ...] = ()
-    keys: tuple[Key, ...] = ()
-    shifts: tuple[Array, ...] = ()
-    answer: RobustSolution | None = None
-    doubts: tuple[Doubt, ...] = ()
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        """One line for each conflict and each doubt."""
-        return (*(one.words for one in self.every), *(one.words for one in self.doubts))
-
-
-class Doubt(Frozen):
-    """A prior that may be wrong: its keys, the probability of that, and the shift (K,) of the numbers without it."""
-
-    keys: tuple[Key, ...]
-    probability: float
-    shift: Array
-    words: str
-
-
 @numerical("the test of what was stated")
 def find_conflicts(
+    every: tuple[Statement, ...],
     problem: Problem,
     end: RobustSolution,
     solver: SolvedFrom,
@@ -232,15 +203,13 @@ def find_conflicts(
     """Find all statements that the rest contradicts: the worst first, each with those found before left out.
 
     Args:
+        every: the statements of the problem.
         problem: of all the observations. end: its solution. solver: solves a changed problem from an estimate.
         part: the problem of the observations that determine the answer. It is solved without contradicted statements,
             as without outliers; None where the answer stays. shifts_at: further scatter of the numbers.
         near: the solution with all statements loosened, if there is one: a wrong one may lead to another minimum.
     """
     most = 4  # solves without a statement
-    every = tuple(statements(problem, end.estimate))
-    if not every:
-        return Conflicts()
     reduced = end.information
     search = _ForwardSelection(problem, end, solver, every, shifts_at, near)
     while search.solves < most and search.leave_out_the_worst():

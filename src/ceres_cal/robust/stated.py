@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, combinations
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from ceres_cal.base import Array, Frozen, is_diagonal, log_chi2_tail, replace, t
 from ceres_cal.effects.aside import DOUBTFUL
 from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Options, Problem, intrinsic_keys, values_of
+
+if TYPE_CHECKING:
+    from ceres_cal.robust.robust import RobustSolution
 
 LEVEL = 1e-3
 """Probability of any conflict, over all statements, where everything stated is right. A conflict withdraws a
@@ -50,6 +53,37 @@ class Conflict(Frozen, eq=True):
     def number(self) -> tuple[str, str, str]:
         """Owner, quantity and unit of the number: its key without the kind."""
         return self.owner, self.quantity, self.unit
+
+
+class Conflicts(Frozen):
+    """The statements that are contradicted, and how the numbers move without each of them.
+
+    Attributes:
+        every: the conflicts. shifts: (K,) each, over the shared keys (K): by how much the numbers move when statements
+            in conflict are left out, or when they are kept.
+        answer: the solution without contradicted statements; None where the answer stays.
+        doubts: priors that look wrong but are too likely right to be set aside.
+    """
+
+    every: tuple[Conflict, ...] = ()
+    keys: tuple[Key, ...] = ()
+    shifts: tuple[Array, ...] = ()
+    answer: RobustSolution | None = None
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """One line for each conflict and each doubt."""
+        return (*(one.words for one in self.every), *(one.words for one in self.doubts))
+
+
+class Doubt(Frozen):
+    """A prior that may be wrong: its keys, the probability of that, and the shift (K,) of the numbers without it."""
+
+    keys: tuple[Key, ...]
+    probability: float
+    shift: Array
+    words: str
 
 
 class WaldTest(NamedTuple):

@@ -138,6 +138,12 @@ def all_shown(camera: Camera, sights: Sights) -> bool:
     return all(bool(np.all(camera.lens.shows(pixels, camera.phi))) for pixels in places)
 
 
+def shows_all(end: RobustSolution) -> bool:
+    """Whether no lens folds inside the observed part of the image."""
+    sights, cameras = end.problem.sights, end.estimate.cameras.items()
+    return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)
+
+
 def require_usable(
     end: RobustSolution, problem: Problem, groups: Sequence[Mask], *, is_refit: bool = False
 ) -> tuple[str, ...]:

@@ -4,8 +4,9 @@ whole, higher at one place than around it, or with a field that is painted out o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -170,11 +171,11 @@ def _of_stretch(evidence: Evidence) -> Words:
     return evidence.words(sentence, advice, ("x over y",), "mm")
 
 
-def _bowed(case: Case) -> Iterator[EffectColumns]:
+def _bowed(case: Case) -> EffectColumns:
     """A floor that is not plane: it falls or rises towards its edges, or is twisted."""
     target, names, (x, y) = _over_targets(case)
     heights = np.column_stack([x * x, y * y, x * y])
-    yield EffectColumns(_moved(case, 2)[:, None] * heights, target, names)
+    return EffectColumns(_moved(case, 2)[:, None] * heights, target, names)
 
 
 def _of_bow(evidence: Evidence) -> Words:
@@ -188,10 +189,10 @@ def _of_bow(evidence: Evidence) -> Words:
     )
 
 
-def _sheared(case: Case) -> Iterator[EffectColumns]:
+def _sheared(case: Case) -> EffectColumns:
     """A field whose lines along x are not at right angles to those along y."""
     target, names, (x, y) = _over_targets(case)
-    yield EffectColumns((_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
+    return EffectColumns((_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
 
 
 def _of_shear(evidence: Evidence) -> Words:
@@ -205,7 +206,7 @@ def _lower(mm: float, sd: float) -> str:
     return f"{'higher' if mm > 0.0 else 'lower'} by {with_sd(abs(mm), sd)}"
 
 
-def _uneven(case: Case) -> Iterator[EffectColumns]:
+def _uneven(case: Case) -> EffectColumns:
     """A floor that is higher or lower at one place."""
     # Equations from which on the height of a place is tested: one height, and as many as contradict an outlier.
     # Halving or doubling changes nothing.
@@ -223,7 +224,7 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
         at = [(place - span // 2) * cell_m for place in (x, y)]
         subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
     enough = _with_enough(group, case.model.used, fewest_at_place)
-    yield EffectColumns(_moved(case, 2)[:, None], enough, tuple(subjects))
+    return EffectColumns(_moved(case, 2)[:, None], enough, tuple(subjects))
 
 
 def _of_place(evidence: Evidence) -> Words:
@@ -273,6 +274,18 @@ def _has_floor(observations: Observations) -> bool:
     return any(not observations.targets[view.target].movable for view in observations.shown_views)
 
 
+def _of_floor(
+    kind: str, columns: Callable[[Case], EffectColumns], words: Callable[[Evidence], Words], **more: Any
+) -> Effect:
+    """An effect of floors, where there are any."""
+
+    def over(case: Case) -> Iterator[EffectColumns]:
+        if _has_floor(case.problem.observations):
+            yield columns(case)
+
+    return Effect(kind, over, words, absorbed=True, **more)
+
+
 def _has_few_boards(observations: Observations) -> bool:
     """Whether there are boards whose stretch may be invisible in so few views: from 7 views on, 0.2 % is visible."""
     most_views = 14  # twice as many, for any noise: with 20 views it took a fifth of the time
@@ -306,11 +319,11 @@ BOARD_STRETCHED = _of_target(
     concerns=_has_few_boards,
 )
 """A board is printed longer one way than the other."""
-_of_floor = partial(Effect, absorbed=True, prior=FLOOR_OFF, reach=_reach_m, concerns=_has_floor)
+_of_whole_floor = partial(_of_floor, prior=FLOOR_OFF, reach=_reach_m, concerns=_has_floor)
 EFFECTS = (
-    _of_floor("floor bowed", _bowed, _of_bow),
-    Effect("floor uneven", _uneven, _of_place, absorbed=True),
-    _of_floor("field sheared", _sheared, _of_shear),
+    _of_whole_floor("floor bowed", _bowed, _of_bow),
+    _of_floor("floor uneven", _uneven, _of_place),
+    _of_whole_floor("field sheared", _sheared, _of_shear),
     Effect("other length", _lengths, _of_length),
     CURVE_ASIDE,
     POINT_ASIDE,

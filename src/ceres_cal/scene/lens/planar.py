@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-from numpy.polynomial.polynomial import polyval
 
 from ceres_cal.base import AnyArray, Array, Frozen, cached_property
 from ceres_cal.kernels import NOTHING, Optics, inverse_of_growing, lens_images, lens_rays
@@ -23,18 +22,17 @@ STEPS = 60  # limit as a safeguard: Newton needs 4 to 8
 
 
 def horner(polynomial: Array, x: Array) -> Array:
-    """sum c_k x^k, lowest power first."""
+    """sum c_k x^k, lowest power first; coefficients are numbers, or arrays like x."""
     total = np.full_like(x, polynomial[-1])
     for coefficient in polynomial[-2::-1]:
         total *= x
-        if coefficient != 0.0:  # every other one is 0 in most lenses
-            total += coefficient
+        total += coefficient
     return total
 
 
 def derivative(polynomial: Array) -> Array:
-    """Return the coefficients of a polynomial's derivative, lowest power first."""
-    return np.asarray(polynomial[1:] * np.arange(1, len(polynomial)))
+    """Return the coefficients (..., T - 1) of a polynomial's derivative, lowest power first."""
+    return np.asarray(polynomial[..., 1:] * np.arange(1, polynomial.shape[-1]))
 
 
 def less(polynomial: AnyArray, other: AnyArray) -> Array:
@@ -88,7 +86,7 @@ def along_pieces(pieces: Array, width: float, x: Array) -> Array:
     """Return polynomials on successive intervals, see `Profile`, at x of any shape."""
     places = x / width
     number = np.clip(places, 0.0, len(pieces) - 1.0).astype(int)
-    return np.asarray(polyval(places - number, np.moveaxis(pieces[number], -1, 0), tensor=False))
+    return horner(np.moveaxis(pieces[number], -1, 0), places - number)
 
 
 def ratio(above: Array, below: Array = NOTHING, end: float = np.inf) -> Profile:

@@ -10,12 +10,11 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
-from numpy.polynomial.polynomial import polyder
 
 from ceres_cal.base import Array, Mask, cached_property, grid_places, rms, two_digits
 from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness, required_powers
-from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces
+from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces, derivative
 
 _GRID = COLUMNS, ROWS = 16, 12  # of a surface's nodes
 EXTENTS = ("wide", "high")
@@ -138,7 +137,7 @@ def growing(coefficients: Array) -> Profile:
     beyond = np.zeros(DEGREE + 1)
     beyond[:2] = np.sum(own[-1]), own[-1] @ np.arange(DEGREE + 1)
     every = np.vstack([own, beyond])
-    slopes = polyder(every, axis=1)
+    slopes = derivative(every)
     return Profile(every, NOTHING, float(first_falls(partial(along_pieces, slopes, width))[0]), width)
 
 
