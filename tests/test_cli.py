@@ -845,7 +845,7 @@ def test_simulate_calibrate_compare(say: Say, capsys: pytest.CaptureFixture[str]
     table = capsys.readouterr().out
     assert "phi px" in table
     tied = scene not in ("boards", "rings-2004")
-    assert ("map at z = 0.15 m: off by " in table) == tied and ("alpha deg" in table) == tied
+    assert ("map at z = 0.15 m: mean error " in table) == tied and ("alpha deg" in table) == tied
 
 
 def test_compare_says_no(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
