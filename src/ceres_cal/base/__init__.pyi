@@ -30,6 +30,7 @@ from ceres_cal.base.arrays import medians_known as medians_known
 from ceres_cal.base.arrays import numbers_of as numbers_of
 from ceres_cal.base.arrays import numerical as numerical
 from ceres_cal.base.arrays import quantile as quantile
+from ceres_cal.base.arrays import ridged_root_of as ridged_root_of
 from ceres_cal.base.arrays import rms as rms
 from ceres_cal.base.arrays import rms_and_largest as rms_and_largest
 from ceres_cal.base.arrays import root_of as root_of
@@ -87,6 +88,7 @@ from ceres_cal.base.tails import NORMAL_95_ONE_SIDED as NORMAL_95_ONE_SIDED
 from ceres_cal.base.tails import log_binomial_tail as log_binomial_tail
 from ceres_cal.base.tails import log_chi2_tail as log_chi2_tail
 from ceres_cal.base.tails import log_f_tail as log_f_tail
+from ceres_cal.base.tails import mixture_95 as mixture_95
 from ceres_cal.base.tails import student_95 as student_95
 from ceres_cal.base.tails import tail_root as tail_root
 from ceres_cal.base.tails import upper_tail as upper_tail
