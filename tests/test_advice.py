@@ -455,7 +455,7 @@ def test_the_command_for_scripts(file: str, capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     "more, message",
     [
-        (["--height-mm", "x"], "--height-mm: 'x' is no length: write a number of mm, or 5m, 150mm"),
+        (["--height-mm", "x"], "--height-mm: 'x' is not a length: write a number of mm, or 5m, 150mm"),
         (["--station", "k"], "there is no station 'k': choose one of overhead"),
         (["--board", "9x6"], "board '9x6': write COLUMNSxROWSxSQUARE, such as 9x6x25mm"),
         (["--board", "1x6x100"], "columns and rows count inner corners"),

@@ -161,7 +161,7 @@ PLANS = {
     "other.toml": ('[[job]]\nname = "a"\ncommand = "locate"\n', "there is no command 'locate' for a batch"),
     "usage.toml": ('[[job]]\nname = "a"\ncommand = "check"\n', "job 'a': the following arguments are required"),
     "output.toml": ('[[job]]\nname = "a"\ncommand = "calibrate"\narguments = "x -o y"\n', "leave out"),
-    "empty.csv": ("name,command,arguments\n", "there is no job in it"),
+    "empty.csv": ("name,command,arguments\n", "it contains no job"),
     "plan.txt": ("", "a plan is a folder, or a table in .jsonl, .csv or .toml"),
 }
 

@@ -607,10 +607,10 @@ def fourth_board_with(*rows: int) -> Observations:
     [
         (
             lambda: corners_at(lambda p: np.arange(len(p)) < 3),
-            r"'0001'.*3 points.*phi of the camera are not determined: add",
+            r"'0001'.*3 points.*phi of the camera cannot be determined: add",
         ),
         (lambda: corners_at(lambda p: np.arange(len(p)) < 5), "10 measured numbers.*cannot determine 11 unknowns: add"),
-        (lambda: corners_at(lambda p: p[:, 1] == 0.0), "8 points.*cannot fix its pose: .*y.* are not determined"),
+        (lambda: corners_at(lambda p: p[:, 1] == 0.0), "8 points.*cannot fix its pose: .*y.* cannot be determined"),
         (lambda: lines_named("HalfwayLine"), "station 'overhead'.*29 curve observations.*cannot fix its pose"),
         (
             lambda: lines_named("TopTouchLine", "CenterLine", "BottomTouchLine"),

@@ -181,7 +181,7 @@ def test_lengths_are_taken_everywhere(say: Say, tmp_path: Path) -> None:
     options = json.loads(out.read_text())["options"]
     assert options["priors"] == [{"station": "overhead", "height_m": 4.02, "sigma_m": 0.01}]
     assert options["tolerances"]["field"]["lines_m"] == 0.01
-    assert "--square: 'wide' is no length" in refused(say("detect", "board", *board, "--square", "wide"))
+    assert "--square: 'wide' is not a length" in refused(say("detect", "board", *board, "--square", "wide"))
 
 
 @pytest.mark.parametrize(
@@ -815,7 +815,7 @@ def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatc
         (("1,2", "--file", "rows.csv"), "not both"),
         (("--file", "rows.csv"), "rows.csv, line 2: 'two' is not a finite number"),
         (("1,2", "--station", "attic"), "there is no station 'attic': choose one of overhead"),
-        (("1,2", "--height-mm", "nan"), "'nan' is no length: write a number of mm, or 5m, 150mm"),
+        (("1,2", "--height-mm", "nan"), "'nan' is not a length: write a number of mm, or 5m, 150mm"),
     ],
 )
 def test_wrong_rows(

@@ -197,7 +197,7 @@ def test_what_is_typed() -> None:
     assert circle.sigma == (0.001,)
     for text, words in (
         ("penalty", "may be penalty_area_depth_m or penalty_area_width_m"),
-        ("height", "'height' is no dimension: there are field_length_m"),
+        ("height", "'height' is not a dimension: there are field_length_m"),
         ("length,length", "given twice"),
         ("length=long", "is not a finite number"),
         ("length=9:0", "sigma above 0"),

@@ -114,7 +114,7 @@ def test_the_look_up_table_is_a_format(tmp_path: Path, capsys: pytest.CaptureFix
         (("--to", "toy", "-o", "a.txt"), "a.txt: a file of format toy ends in .toy or .gz.toy"),
         (("--to", "toy", "-o", "a.toy", "--station", "x"), "there is no station 'x'"),
         (("--to", "toy", "-o", "a.toy", "--digits", "x"), "--digits: 'x' is not a valid value"),
-        (("--to", "toy", "-o", "a.toy", "--step-px", "4"), "--step-px is no option of format toy"),
+        (("--to", "toy", "-o", "a.toy", "--step-px", "4"), "--step-px is not an option of format toy"),
         (("--to", "folder", "-o", "d", "--station", "overhead", "--station", "overhead"), "holds one station, not 2"),
         (("--to", "table", "-o", "t.npz", "--error-mm", "nan"), "--error-mm: 'nan' is not a finite number"),
         (("--to", "toy", "-o", "calibration.json"), "is an input, and the output would replace it"),

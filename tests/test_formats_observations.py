@@ -134,7 +134,7 @@ def test_keypoints_of_colmap_lose_their_half_pixel(tmp_path: Path) -> None:
         ("a.csv", "x_px,y_px,who\n1,2,3", "unknown column 'who'"),
         ("a.csv", "x_px,y_px,point\n1,2,Nose", "line 2: there is no feature 'Nose'"),
         ("a.csv", "x_px,y_px,point\n1,2,CentreMark", "no feature 'CentreMark': did you mean 'CenterMark'?"),
-        ("a.csv", "x_px,y_px,point\n1,z,CenterMark", "line 2: y_px is no finite number, but 'z'"),
+        ("a.csv", "x_px,y_px,point\n1,z,CenterMark", "line 2: y_px is not a finite number, but 'z'"),
         ("a.csv", "x_px,y_px,point\n", "it holds no row"),
         ("a.csv", "point,x_px,y_px\nCenterMark,102,4,800,1", "line 2 has more values than there are columns"),
         ("a.npz", "hello", "not an NPZ file"),

@@ -243,7 +243,7 @@ def test_a_field_goes_out_and_comes_back(division: str) -> None:
 
 
 def test_what_is_no_field_is_refused() -> None:
-    with pytest.raises(InputError, match="no lines: it is no field"):
+    with pytest.raises(InputError, match="no lines: it is not a field"):
         field_of(custom({"pole": (0.0, 0.0, 1.0)}))
     with pytest.raises(InputError, match="the field has no field_width in mm"):
         target_of({"field_length": 9000})

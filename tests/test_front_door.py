@@ -1,7 +1,7 @@
 """From arrays to a calibration and back in a few lines, as users of OpenCV type them."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from scenery import overhead_pose
 
 import ceres_cal
-from ceres_cal import Camera, InputError, Observations, Pose, View, calibrate, checkerboard, ssl_field
+from ceres_cal import Camera, InputError, Observations, Pose, View, calibrate, checkerboard, custom, ssl_field
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.images import image_files
 from ceres_cal.scene.lens import Brown
@@ -95,6 +95,24 @@ def test_one_pixel_and_metres() -> None:
     ):
         camera.locate([640, 480], 150)
     assert np.isnan(camera.locate([640, 480], 6.0)).all()  # over the camera, but a height
+
+
+def test_small_integers_of_numpy_do_not_wrap_around() -> None:
+    """Warned of an overflow, as 20 x 20 is 144 in eight bits."""
+    assert len(checkerboard(cast(int, np.uint8(20)), cast(int, np.uint8(20)), 0.1).points) == 400
+
+
+def test_what_are_no_numbers_is_named() -> None:
+    """Both ended with a traceback of NumPy or of Python; an infinite height was said to be infinite millimetres."""
+    camera = TRUE.at(overhead_pose(0.0, 0.0, 4.0, 3.0, 2.0))
+    with pytest.raises(InputError, match=r"pixels must be numbers, not list \[\[1, 2\], \[3\]\]"):
+        camera.locate([[1, 2], [3]])
+    with pytest.raises(InputError, match=r"points_world must be numbers, not list \[\[1, 2\], \[3\]\]"):
+        camera.project([[1, 2], [3]])
+    with pytest.raises(InputError, match=r"height_m must be a number of metres, such as 0\.15, not inf"):
+        camera.locate([[1.0, 2.0]], float("inf"))
+    with pytest.raises(InputError, match=r"point 'pole' must be three numbers \(x, y, z\) in metres, not \(1.0, 2.0\)"):
+        custom({"pole": (1.0, 2.0)})  # type: ignore[dict-item]
 
 
 def test_what_is_public() -> None:

@@ -85,7 +85,7 @@ def test_everything_has_its_type() -> None:
     [
         (("--size", "1"), "required: FIRST"),
         (("x",), "required: --size"),
-        (("x", "--size", "wide"), "'wide' is no length"),
+        (("x", "--size", "wide"), "'wide' is not a length"),
         (("x", "--size", "1", "--count", "a"), "--count: 'a' is not a whole number"),
         (("x", "--size", "1", "--kind", "c"), "invalid choice: 'c'"),
         (("x", "--size", "1", "--one", "--other"), "not allowed with"),

@@ -252,7 +252,7 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object], folder: Path
             lambda d: next(iter(d["cameras"].values())).update(phi=float("nan")),
             "nan is not a finite number - at `$.cameras",
         ),
-        (lambda d: next(iter(d["stations"].values())).update(rotation=[[1, 0, 0]] * 3), "is no rotation matrix"),
+        (lambda d: next(iter(d["stations"].values())).update(rotation=[[1, 0, 0]] * 3), "is not a rotation matrix"),
         (
             lambda d: next(iter(d["stations"].values())).update(position_m=[0, 0, 9]),
             "position_m or euler_rad disagrees",
@@ -314,7 +314,7 @@ def test_tables_that_contradict_themselves(
 @pytest.mark.parametrize(
     "name, old, new, words",
     [
-        ("colmap/frames.txt", rb"0\.7", b"7.0", "is no rotation matrix"),
+        ("colmap/frames.txt", rb"0\.7", b"7.0", "is not a rotation matrix"),
         ("colmap/images.txt", b"overhead", b"over\xff", "image 1 is not UTF-8"),
         (
             "opencv.xml",
@@ -323,7 +323,7 @@ def test_tables_that_contradict_themselves(
             "must be finite numbers",
         ),
         ("camera.xml", rb"(\"focal length\"[^>]*>\s*)[0-9.,]+", rb"\g<1>5e-324", "is impossible"),
-        ("camera.xml", rb"(camera index[^>]*>)[0-9]+", rb"\g<1>1e400", "is no number"),
+        ("camera.xml", rb"(camera index[^>]*>)[0-9]+", rb"\g<1>1e400", "is not a number"),
         ("opencv.json", rb'"overhead"', rb'"\\ud800"', "stations is not UTF-8"),
         ("geometry.yml", rb"(?<=focal_length: )[0-9.]+", b"1" + b"0" * 400, "too large"),
     ],

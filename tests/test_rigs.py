@@ -123,7 +123,7 @@ def test_frames_of_one_moment(left: list[str], right: list[str], rule: str, mome
         (["left1", "left2", "left3"], "left*,*", "several patterns fit"),
         (["left1", "left2", "left3"], "left,right", r"one \* in each"),
         (["left7", "left8", "left9"], "left*,right*", "no two cameras have a frame in common"),
-        (["left1", "left2", "left3"], "within:0.4", "'left1' is no number"),
+        (["left1", "left2", "left3"], "within:0.4", "'left1' is not a number"),
     ],
 )
 def test_frames_are_never_guessed(left: list[str], rule: str, why: str) -> None:

@@ -116,7 +116,7 @@ def test_few_boards_tell_nothing_of_a_place_in_the_world() -> None:
 
 
 def test_what_is_open_is_named() -> None:
-    with pytest.raises(DegenerateError, match="cannot fix its pose: direction, x of the camera are not determined"):
+    with pytest.raises(DegenerateError, match="cannot fix its pose: direction, x of the camera cannot be determined"):
         calibrate(seen(("BottomTouchLine", "TopTouchLine")), KNOWN)
 
 

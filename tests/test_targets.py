@@ -429,9 +429,9 @@ BAD_SPECS: list[tuple[Any, str]] = [
 
 @pytest.mark.parametrize("number", ["x", None, [1.0], (0.0, 1.0)])
 def test_a_curve_of_no_numbers_is_named(number: Any) -> None:
-    with pytest.raises(InputError, match=r"Segment\(end=\.\.\.\): .* is no number, or no three"):
+    with pytest.raises(InputError, match=r"Segment\(end=\.\.\.\) must be "):
         Segment((0.0, 0.0, 0.0), number)
-    with pytest.raises(InputError, match=r"Arc\(radius_m=\.\.\.\): .* is no number"):
+    with pytest.raises(InputError, match=r"Arc\(radius_m=\.\.\.\): .* is not a number"):
         Arc((0.0, 0.0, 0.0), number)
 
 

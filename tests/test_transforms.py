@@ -197,5 +197,5 @@ def test_gamma_is_zero_at_gimbal_lock(sign: float) -> None:
 
 
 def test_numbers_too_large_for_a_rotation_are_refused_without_a_warning() -> None:
-    with pytest.raises(InputError, match="R is no rotation matrix"):
+    with pytest.raises(InputError, match="R is not a rotation matrix"):
         require_rotation(np.full((3, 3), 1e200), "R")

@@ -107,7 +107,7 @@ def require_rotation(matrix: ArrayLike, name: str) -> Array:
         off = float(np.max([*np.abs(m @ m.T - np.eye(3)).flat, abs(np.linalg.det(m) - 1.0)]))
     if not off < rounding:
         raise InputError(
-            f"{name} is no rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"
+            f"{name} is not a rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"
         )
     return m
 

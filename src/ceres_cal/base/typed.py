@@ -87,13 +87,14 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
             for own, one in value.items() if many else ((name, value),):
                 if kinds and not _fits(one, kinds):
                     raise InputError(f"{function.__name__}(): {_wrong(own, one, kinds, function, given)}")
-        return function(*map(_text, args), **{name: _text(value) for name, value in kwargs.items()})
+        return function(*map(_of_python, args), **{name: _of_python(value) for name, value in kwargs.items()})
 
     return call
 
 
-def _text(value: Any) -> Any:
-    return str(value) if isinstance(value, np.str_) else value
+def _of_python(value: Any) -> Any:
+    """Return a number or text of NumPy as Python's: products of its small integers would wrap around."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _meant(given: Mapping[str, Any], known: Mapping[str, Any]) -> str:

@@ -143,7 +143,7 @@ def length(unit: str) -> Callable[[str], float]:
         try:
             return parse_length(text, "a length", unit)
         except InputError:
-            raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
+            raise ArgumentTypeError(f"{text!r} is not a length: write a number of {unit}, or 5m, 150mm") from None
 
     return parse
 
@@ -160,7 +160,7 @@ def share(text: str) -> float:
 def name(text: str) -> str:
     """The type of an argument that is a name, which files hold as UTF-8."""
     if not text or text != printable(text):
-        raise ArgumentTypeError(f"'{printable(text)}' is no name in UTF-8: give another one")
+        raise ArgumentTypeError(f"'{printable(text)}' is not a name in UTF-8: give another one")
     return text
 
 
@@ -281,7 +281,7 @@ def _parsed(text: str, targets: Mapping[str, scene.Target]) -> Prior:
     found = [(name, one) for name in targets if owner in ("", name) for one in _meant(word, targets[name].dimensions)]
     if len(found) != 1:
         names = [one for name in targets if owner in ("", name) for one in targets[name].dimensions]
-        said = f"may be {' or '.join(one for _, one in found)}" if found else "is no dimension"
+        said = f"may be {' or '.join(one for _, one in found)}" if found else "is not a dimension"
         raise InputError(f"{where}: {word!r} {said}: there are {', '.join(names) or 'none'}")
     ((name, dimension),) = found
     drawn_m = targets[name].dimensions[dimension]

@@ -188,7 +188,7 @@ class _Once(argparse.Action):
 def _file(text: str) -> str:
     """The type of an argument that names files; an empty name, such as of an unset variable, is refused."""
     if text in ("", "-"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no file: give its name (./- where that is -)")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a file: give its name (./- where that is -)")
     return text
 
 

@@ -75,7 +75,7 @@ def _typed(
     options = {}
     for name, text in given.items():
         if name not in types:
-            raise InputError(f"{flag(name)} is no option of format {forms[0].name}")
+            raise InputError(f"{flag(name)} is not an option of format {forms[0].name}")
         try:
             plain = str(parse_length(text, flag(name), "mm")) if name.endswith("_mm") else text
             options[name] = msgspec.convert(plain, types[name], strict=False)

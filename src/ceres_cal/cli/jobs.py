@@ -209,7 +209,7 @@ def read_plan(path: Path) -> tuple[JobSpec, ...]:
     """
     rows = list(_of_folder(path) if path.is_dir() else _of_table(path))
     if not rows:
-        raise InputError(f"{path}: there is no job in it")
+        raise InputError(f"{path}: it contains no job")
     (name, count), *_ = Counter(row.name for row in rows).most_common(1)
     if count > 1:
         raise InputError(f"{path}: {count} jobs are called {name!r}: give each a name of its own")
@@ -245,7 +245,7 @@ def _of_table(path: Path) -> Iterator[JobSpec]:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text in UTF-8: {error}") from None
+        raise InputError(f"{path}: not text in UTF-8: {error}") from None
     read = {".jsonl": _json_lines, ".csv": _csv, ".toml": _toml}[path.suffix]
     for where, data in read(text, str(path)):
         if isinstance(data, dict) and isinstance(data.get("arguments"), str):

@@ -28,8 +28,8 @@ def _run(
         "photographs of one camera at one station, or folders of them; and a calibration to start from, or two to be "
         "compared over one picture",
     ),
-    target: str | None = option("the field, as of `detect field`; the page has a list of them, too", "TARGET"),
-    board: str | None = board_option("a chessboard, as of `run`"),
+    target: str | None = option("the field, as for `detect field`; the page has a list of them, too", "TARGET"),
+    board: str | None = board_option("a chessboard, as for `run`"),
     prior: tuple[str, ...] = prior_option(),
     output: Path = output_option("what is made", Path("camera"), "FOLDER"),
     port: int = option("of the page's address; default: one that is free", "N", 0, read=whole(0, 65535)),

@@ -32,9 +32,9 @@ class RunArguments(QuietArguments):
         "the folder that these are in",
     )
     output: Path = arguments.output_option("everything that is made", metavar="FOLDER")
-    target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
+    target: str | None = option("the field: its name, such as ssl-b, or a file, as for `detect field`", "TARGET")
     facing: tuple[str, ...] = option(
-        "its orientation, as of `detect field`; of several cameras CAMERA.NAME=SIDE",
+        "its orientation, as for `detect field`; of several cameras CAMERA.NAME=SIDE",
         "NAME=SIDE",
         repeatable=True,
         beside=("target",),
@@ -42,13 +42,13 @@ class RunArguments(QuietArguments):
     not_painted: str = arguments.not_painted_option("lines that this field does not have", beside=("target",))
     board: str | None = arguments.board_option(
         "a chessboard by its inner corners and the side of a square, such as 9x6x25mm; another board, of circles or "
-        "AprilTags, as --target of `detect board`"
+        "AprilTags, or markers of known places, as for --target of `detect board`"
     )
-    lens: str = option("as of `calibrate`", "KIND", "auto")
+    lens: str = option("lens model, as for `calibrate`", "KIND", "auto")
     prior: tuple[str, ...] = arguments.prior_option()
     estimate: tuple[str, ...] = arguments.estimate_option(beside=("target",))
     camera: str = arguments.camera_option()
-    to: tuple[str, ...] = option("export it, too, as of `export`", "FORMAT", repeatable=True)
+    to: tuple[str, ...] = option("format of a file for another program, as for `export`", "FORMAT", repeatable=True)
     frames: int = arguments.frames_option()
 
 

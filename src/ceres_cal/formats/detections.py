@@ -183,7 +183,7 @@ def _place_name(place: tuple[float, float, float]) -> str:
 
 
 def _number(row: Mapping[str, Any], name: str, number: int) -> float:
-    return finite(row.get(name), InputError(f"line {number}: {name} is no finite number, but {row.get(name)!r}"))
+    return finite(row.get(name), InputError(f"line {number}: {name} is not a finite number, but {row.get(name)!r}"))
 
 
 def _index(numbers: Mapping[str, int], name: str, number: int) -> int:

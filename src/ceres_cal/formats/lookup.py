@@ -94,7 +94,7 @@ class LookupTable(Frozen):
         try:
             return _table_of(arrays)
         except ValueError as error:
-            raise InputError(f"{path}: is no table ({error}): export it again") from None
+            raise InputError(f"{path}: is not a table ({error}): export it again") from None
 
 
 def _table_of(arrays: Mapping[str, AnyArray]) -> LookupTable:

@@ -59,7 +59,7 @@ def _read(request: ImportRequest) -> Any:
     width, height = numbers("image_size", 2)
     turn = numbers("R", 9).reshape(3, 3)
     if np.max(np.abs(turn)) > 2.0 or np.max(np.abs(turn @ turn.T - np.eye(3))) > 1e-6:
-        raise InputError("R is no rotation")
+        raise InputError("R is not a rotation matrix")
     pose = Pose.looking(numbers("t", 3), turn)
     camera = Camera((int(width), int(height)), phi, (k[2], k[5]), lens, k[4] / k[0], pose)
     camera.require_monotone(request.path.stem)

@@ -160,7 +160,7 @@ def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
     """
     here = f"camera {entry.get('camera_id', '?')}"
     f, cx, cy, d, *rest = (
-        finite(entry.get(name), InputError(f"{here}: {name} is no number, but {entry.get(name)!r}"), LARGEST)
+        finite(entry.get(name), InputError(f"{here}: {name} is not a number, but {entry.get(name)!r}"), LARGEST)
         for name in NAMES
     )
     turn, shift = np.array(rest[:4]), np.array(rest[4:])

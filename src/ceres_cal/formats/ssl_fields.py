@@ -88,7 +88,7 @@ def field_of(target: Target) -> dict[str, Any]:
     """
     curves = target.curves
     if not curves:
-        raise InputError("the target has no lines: it is no field")
+        raise InputError("the target has no lines: it is not a field")
     reach = samples(curves.values())
     length, width = (round(2e3 * float(np.max(np.abs(reach[:, axis])))) for axis in (0, 1))
     sizes = {

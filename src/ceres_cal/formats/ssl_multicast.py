@@ -49,7 +49,7 @@ class Group(Struct, frozen=True):
         if not 0 < self.port < 65536:
             raise InputError(f"port {self.port:.6g}: give one from 1 to 65535")
         if not re.fullmatch(r"2(2[4-9]|3\d)(\.\d{1,3}){3}", self.address):
-            raise InputError(f"{self.address} is no multicast group: give one from 224.0.0.0 to 239.255.255.255")
+            raise InputError(f"{self.address} is not a multicast group: give one from 224.0.0.0 to 239.255.255.255")
 
 
 def wrapped(geometry: Mapping[str, Any]) -> bytes:

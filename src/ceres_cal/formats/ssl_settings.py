@@ -118,7 +118,7 @@ def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
 
 def _number(one: _Var) -> float:
     number = one.text.replace(",", ".")  # decimal comma of some locales
-    return finite(number, InputError(f"{one.path[-1]!r} is no number, but {one.text!r}"), LARGEST)
+    return finite(number, InputError(f"{one.path[-1]!r} is not a number, but {one.text!r}"), LARGEST)
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------

@@ -99,4 +99,4 @@ def _within(frames: _Frames, rule: str) -> _Moments:
 
 
 def _number(text: str, where: str) -> float:
-    return finite(text, InputError(f"same frames within a time: {text!r} is no number ({where})"))
+    return finite(text, InputError(f"same frames within a time: {text!r} is not a number ({where})"))

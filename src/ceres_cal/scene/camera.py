@@ -168,10 +168,11 @@ class Camera(Frozen, eq=True):
 
         A pixel may lie outside the image: nothing is cut off.
         """
-        if np.ndim(points_world) == 1:
-            return np.asarray(self.project(np.asarray(points_world)[None])[0])
+        given = numbers_in(points_world, "points_world")
+        if given.ndim == 1:
+            return np.asarray(self.project(given[None])[0])
         with np.errstate(invalid="ignore"):  # infinite points
-            rays = self.cam_from_world.transform(rows(points_world, 3, "points_world"))
+            rays = self.cam_from_world.transform(rows(given, 3, "points_world"))
         offsets = self.lens.distort(rays, self.phi)
         offsets[:, 0] += self.skew * offsets[:, 1]
         return np.asarray(offsets * (1.0, self.aspect) + self.principal_point)
@@ -190,7 +191,7 @@ class Camera(Frozen, eq=True):
         Raises:
             InputError: a height far above the camera, which is probably in millimetres: heights are in metres.
         """
-        if not isinstance(height_m, Real):
+        if not isinstance(height_m, Real) or abs(height_m) == np.inf:
             raise InputError(f"height_m must be a number of metres, such as 0.15, not {height_m!r}")
         far_m = 10.0  # a height above this, and far above the camera, is in millimetres
         if abs(height_m) > max(far_m, 2.0 * abs(self.position[2])):
@@ -198,9 +199,10 @@ class Camera(Frozen, eq=True):
                 f"height_m is {height_m:g} m, but the camera's height is {self.position[2]:.2f} m: "
                 f"for {height_m:g} mm give {1e-3 * height_m:g}"
             )
-        if np.ndim(pixels) == 1:
-            return np.asarray(self.locate(rows(np.asarray(pixels)[None], 2, "pixels"), height_m)[0])
-        directions = self.rays(pixels) @ self.cam_from_world.rotation
+        given = numbers_in(pixels, "pixels")
+        if given.ndim == 1:
+            return np.asarray(self.locate(rows(given[None], 2, "pixels"), height_m)[0])
+        directions = self.rays(given) @ self.cam_from_world.rotation
         drop = height_m - self.position[2]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = drop / directions[:, 2]

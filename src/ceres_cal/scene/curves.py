@@ -18,15 +18,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, InputError, Mask, dots
+from ceres_cal.base.typed import numbers_in
 
 SIDES = {"centre": 0, "left": 1, "right": -1}
 """Which part of a painted curve was observed. Left and right are seen by somebody who walks along it: from `start` to
 `end` of a segment, counter-clockwise on an arc (so left is the inside)."""
 
 
-def xyz(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return three plain floats, from numbers of any type."""
-    x, y, z = (float(v) for v in values)
+def xyz(values: Sequence[float], name: str) -> tuple[float, float, float]:
+    """Return three plain floats, from numbers of any type; InputError naming the place for anything else."""
+    given = numbers_in(values, name)
+    if given.shape != (3,):
+        raise InputError(f"{name} must be three numbers (x, y, z) in metres, not {values!r}")
+    x, y, z = given.tolist()
     return x, y, z
 
 
@@ -91,10 +95,11 @@ Curve = Segment | Arc
 def _with_plain_floats(curve: Curve, *places: str) -> None:
     """Convert the numbers of a frozen curve, of any type, to plain floats, as a file would give them."""
     for name, value in msgspec.structs.asdict(curve).items():
+        said = f"{type(curve).__name__}({name}=...)"
         try:
-            plain = xyz(value) if name in places else float(value)
+            plain = xyz(value, said) if name in places else float(value)
         except (TypeError, ValueError):
-            raise InputError(f"{type(curve).__name__}({name}=...): {value!r} is no number, or no three") from None
+            raise InputError(f"{said}: {value!r} is not a number") from None
         msgspec.structs.force_setattr(curve, name, plain)
 
 

@@ -319,7 +319,7 @@ def _require_all(
         if names := open_numbers.get(number, ()):
             stated = [_STATED[name] for name in names if name in _STATED]
             state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""
-            what = f"{', '.join(names)} of the camera are not determined: add another point or line{state}"
+            what = f"{', '.join(names)} of the camera cannot be determined: add another point or line{state}"
         else:
             what = _what_poses(sight)
         text = f"frame {frames} ({key}): {said}: {what}, or remove the view"

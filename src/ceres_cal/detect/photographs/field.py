@@ -284,8 +284,8 @@ def require_findable(
     painted = tuple(name for name in target.painted if curves is None or name in curves)
     if not painted:
         raise InputError(
-            "the target has no painted curve: a line to be found needs a width; boards are found by `detect board`, or "
-            "`run --board 9x6x25mm`"
+            "the target has no painted curve: a line to be found needs a width; boards and markers are found by "
+            "`detect board`, or `run --board 9x6x25mm`"
         )
     if target.reach_m > _FIELD_M:
         raise InputError(f"the field reaches {target.reach_m:.0f} m from its origin: give its dimensions in metres")

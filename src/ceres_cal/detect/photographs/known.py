@@ -87,7 +87,7 @@ def detect_known(
     if not wanted:
         raise InputError(
             f"the calibration's targets ({', '.join(calibration.targets)}) have no painted lines"
-            f"{' and are no chessboards' if boards else ''}: give a file of observations instead of images"
+            f"{' and are not chessboards' if boards else ''}: give a file of observations instead of images"
         )
     known = {curve for target in calibration.targets.values() for curve in target.curves}
     if unknown := sorted(set(not_painted) - known):

@@ -38,7 +38,7 @@ def custom(
         InputError: no features at all, a number that is not finite, a curve without length, or paint that covers the
             centre of its arc.
     """
-    points, curves = {name: xyz(place) for name, place in (points or {}).items()}, dict(curves or {})
+    points, curves = {name: xyz(place, f"point {name!r}") for name, place in (points or {}).items()}, dict(curves or {})
     if not points and not curves:
         raise InputError("custom target: give at least one point, segment or arc")
     require_places("custom target", points, curves)
