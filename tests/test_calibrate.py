@@ -835,3 +835,38 @@ def test_pixels_that_may_not_be_square_are_said_to(aspect: float, words: tuple[s
         seen = simulate(scene, Disturbance(points_sigma_px=0.15, curves_sigma_px=0.15), seed=seed).observations
         said = [text for text in calibrate(seen, Options(lens="brown")).warnings if "fy / fx" in text]
         assert len(said) == bool(expected) and expected in "".join(said)
+
+
+def clicked_rig(counts: Mapping[str, int]) -> Observations:
+    """Cameras over a field, so many clicks of each to 1 px."""
+    rng, field, size, every = np.random.default_rng(4), ssl_field("B"), (1280, 960), list[Observations]()
+    for number, (name, count) in enumerate(counts.items()):
+        pose = Pose.looking((3.0 * number - 1.5, 0.2, 4.5), rotation_exp((np.pi - 0.3, 0.05, 0.0)))
+        camera = Camera(size, 700.0, (640.0, 480.0), Brown((-0.1, 0.01, 0.0, 0.0, 0.0))).at(pose)
+        pixels = camera.project(field.point_array) + rng.normal(0.0, 1.0, (len(field.points), 2))
+        seen = np.flatnonzero(((pixels > 0.0) & (pixels < (1279.0, 959.0))).all(axis=1))
+        clicks = np.full(pixels.shape, np.nan)
+        chosen = rng.permutation(seen)[:count]
+        clicks[chosen] = pixels[chosen]
+        every.append(Observations.from_points(clicks, field, size, camera=name))
+    return sum(every[1:], every[0])
+
+
+@pytest.mark.parametrize(
+    "counts, message",
+    [
+        (
+            {"a": 6, "b": 4},
+            "camera 'b': 9 measured numbers.*12 unknowns: .*at least 2 points or 3 .*1 other camera can",
+        ),
+        (
+            {"a": 5, "b": 5},
+            "camera 'a': 11 measured numbers.*12 unknowns: add observations, at least 1 point or 1 curve",
+        ),
+    ],
+    ids=str,
+)
+def test_the_camera_of_a_rig_that_lacks_clicks_is_named(counts: Mapping[str, int], message: str) -> None:
+    """It was "22 measured numbers cannot determine 24 unknowns", or a lens that folds: "choose fewer coefficients"."""
+    with pytest.raises(DegenerateError, match=message):
+        calibrate(clicked_rig(counts))

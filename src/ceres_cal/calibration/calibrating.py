@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -89,21 +89,47 @@ def calibrate(
                 raise type(error)(f"{apart}: {error}") from None
             free = _without_priors(observations, options)
             if free is None:
-                raise type(error)(f"{error}{_others_can(error, observations, options)}", error.camera) from None
+                raise _of_a_camera(error, observations, options) from None
             return _from_there(free, observations, options)
 
 
-def _others_can(failure: CalibrationError, observations: Observations, options: Options) -> str:
-    """Return the end of the error message that says that the other cameras can be calibrated; "" where they cannot."""
-    left_out, found = list[str](), cast("CalibrationError | Calibration", failure)
+def _of_a_camera(failure: CalibrationError, observations: Observations, options: Options) -> CalibrationError:
+    """Return the failure of the first camera that fails by itself, too, or else the same one; its message ends with the
+    cameras without which the others can be calibrated.
+    """
+    alone = _failing_alone(observations, options)
+    first, left_out = next(iter(alone.values()), failure), list[str]()
+    found: CalibrationError | Calibration = first
     while isinstance(found, CalibrationError):
-        if found.camera is None or len(observations.cameras) < 2 or is_bulk(observations):
-            return ""
-        left_out.append(found.camera)
-        observations = observations.without_camera(found.camera)
+        names = [*alone] if alone and not left_out else [found.camera]
+        if len(names) >= len(observations.cameras) or is_bulk(observations):
+            return first
+        for name in names:
+            if name is None:
+                return first
+            left_out.append(name)
+            observations = observations.without_camera(name)
         found = attempt(partial(_measured, observations, options, None, None))  # reads: "... 3 other cameras can"
     those, others = ", ".join(map(repr, left_out)), counted(len(observations.cameras), "other camera")
-    return f"; {others} can be calibrated if the observations of {those} are left out"
+    can = f"{others} can be calibrated if the observations of {those} are left out"
+    return type(first)(f"{first}; {can}", first.camera)
+
+
+def _failing_alone(observations: Observations, options: Options) -> dict[str, CalibrationError]:
+    """Return the failures of the cameras of a rig that cannot be calibrated by themselves, and need not see what is
+    placed before others. What one camera lacks, the sums of all may hide, and an impossible lens may show it.
+    """
+    shown = {name: observations.of_camera(name) for name in observations.cameras}
+    failures = dict[str, CalibrationError]()
+    for name, own in shown.items():
+        others = {placement for other, one in shown.items() if other != name for placement in one.placements}
+        if len(shown) < 2 or is_bulk(observations) or others.intersection(own.placements):
+            continue
+        # reads: "camera 'c1': 11 measured numbers cannot determine 12 unknowns"
+        found = attempt(partial(_measured, own, replace(options, priors=own.about_shown(options.priors)), None, None))
+        if isinstance(found, CalibrationError):
+            failures[name] = type(found)(str(found) if repr(name) in str(found) else f"camera {name!r}: {found}", name)
+    return failures
 
 
 def lenses_by_held_out(observations: Observations, options: Options) -> Mapping[str, LensChoice]:

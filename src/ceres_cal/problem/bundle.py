@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyceres
 
-from ceres_cal.base import Array, DegenerateError, Frozen, InputError, SolutionError, at_most, available
+from ceres_cal.base import Array, DegenerateError, Frozen, InputError, SolutionError, at_most, available, plural
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import STRUCTURE, Owner, Sights
 from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, CachedCost, EliminatedCost, PriorCost, Run, SightCost
@@ -269,9 +269,11 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
             f"; no camera explains the others of the {observed} that were observed: check the names of features, and "
             "that pixels are x, y from the top left"
         )
+        missing = unknowns - problem.equations - known
+        more = f"{plural((missing + 1) // 2, 'point')} or {plural(missing, 'curve observation')}"
         raise DegenerateError(
             f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "
-            f"cannot determine {unknowns} unknowns: add observations, or fix some of the unknowns"
+            f"cannot determine {unknowns} unknowns: add observations, at least {more}, or fix some of the unknowns"
             f"{others if problem.equations < observed else ''}"
         )
 
