@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, median
+from ceres_cal.base.frozen import Frozen
 
 USUAL_PX = 0.1
 _MOST_DEGREES = 6
@@ -44,8 +44,7 @@ def _of_board(grid: Array, board: Array) -> float | None:
     return float(np.sqrt(np.sum((grid[seen] - picture(board[seen])) ** 2) / picture.spare))
 
 
-@dataclass(frozen=True)
-class SmoothPicture:
+class SmoothPicture(Frozen):
     """A map from places on a board to pixels: a homography, and a polynomial of the places.
 
     Attributes:
