@@ -100,7 +100,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.robust", "AT_REST", "calibrate"),
     *_of("robust.robust", "_ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),
     *_of("robust.robust", "AT_REST_AGAIN", "refit"),
-    *_of("robust.noise", "_LEAST_SPARE _BORROWED", "calibrate"),
+    *_of("robust.noise", "LEAST_SPARE _BORROWED", "calibrate"),
     *_of("robust.noise", "LARGER", "diagnose"),
     *_of("robust.noise", "USUAL_EQUATIONS", "refit"),
     *_of("robust.conflicts", "_SUSPICIOUS _RIVAL", "calibrate"),

@@ -7,7 +7,7 @@ import numpy as np
 from ceres_cal.base import NORMAL_95, Mask, median, mixture_95
 from ceres_cal.problem import Estimate, Problem
 from ceres_cal.problem.residuals import relative_lengths, residuals
-from ceres_cal.robust.noise import LEAST_SCALE, squares_beside
+from ceres_cal.robust.noise import LEAST_SCALE, LEAST_SPARE, squares_beside
 
 # Logarithm of the ratio of noise scales up to which sds are right, as far as hundreds of runs can tell.
 _ALIKE = float(np.log(1.25))
@@ -38,7 +38,7 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
     names, cameras = np.array(observations.noise_names), np.array([view.camera for view in observations.views])
     before = np.array([observations.noise.get(name, 1.0) for name in names.tolist()])
     before /= median(np.repeat(before, equations))
-    noise, changes = dict[str, float](), [0.0]
+    noise, changes, spare = dict[str, float](), [0.0], 0.0
     for name in dict.fromkeys(names.tolist()):
         own = names == name
         count, shown = int(equations[own].sum()), [observations.views[view] for view in np.flatnonzero(own)]
@@ -50,9 +50,11 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
         free = len(layout.free.get(camera, ())) / equations[cameras == camera].sum()
         taken_up, parts = min(free + 6 * poses / count, 1.0), zip(lengths, seen, views, strict=True)
         relative = [now * length[used & own[view]] for length, used, view in parts]
-        noise[name] = _scale_of_few(*squares_beside(relative, taken_up, problem.options.reject_sigma))
+        squares, freedom = squares_beside(relative, taken_up, problem.options.reject_sigma)
+        noise[name], spare = _scale_of_few(squares, freedom), spare + freedom
         changes.append(abs(float(np.log(noise[name] / now))))
-    return noise if max(changes) > _ALIKE else dict(observations.noise)
+    # Of fewer the stated sigmas are taken, which is no usual scale: factors of a rig of few clicks grew to 50.
+    return noise if max(changes) > _ALIKE and spare >= LEAST_SPARE else dict(observations.noise)
 
 
 def _scale_of_few(squares: float, freedom: float) -> float:

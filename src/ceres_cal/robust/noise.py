@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # Degrees of freedom below which the stated sigmas are taken as they are: at 8 the spread has an error of 25 %. Errors
 # of fits to ten points are 1.16 of their stated sigmas with 8; with 4 they are 1.46, and with 16 they are 0.8, because
 # then the stated sigmas are taken.
-_LEAST_SPARE = 8.0
+LEAST_SPARE = 8.0
 # Degrees of freedom for which the noise of the other kind counts: a few points beside many curve observations, which
 # the fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
 _BORROWED = 4.0
@@ -209,7 +209,7 @@ def noise_of(
     floor = usual or (0.0, 0.0)
     spare_of_all = 2.0 * redundancy[0] * points.count + redundancy[1] * curves.count
     known = spare_of_all + (USUAL_EQUATIONS if usual else 0.0)
-    reject_sigma = options.reject_sigma if known < _LEAST_SPARE else _as_rare(options.reject_sigma, known)
+    reject_sigma = options.reject_sigma if known < LEAST_SPARE else _as_rare(options.reject_sigma, known)
     p_sums = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy[0])
     c_sums = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy[1])
     spare = 2.0 * redundancy[0] * p_sums[0], redundancy[1] * c_sums[0]
@@ -217,7 +217,7 @@ def noise_of(
     if usual is not None:
         p, c = _scale_from(usual[0], p_sums, spare[0]), _scale_from(usual[1], c_sums, spare[1])
         degrees = max(degrees, 0.0) + USUAL_EQUATIONS
-    elif degrees < _LEAST_SPARE:
+    elif degrees < LEAST_SPARE:
         p, c, degrees = 1.0, 1.0, np.inf
     else:
         p, c = _scale(p_sums, spare[0], c_sums, spare[1]), _scale(c_sums, spare[1], p_sums, spare[0])
