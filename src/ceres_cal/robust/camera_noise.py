@@ -38,7 +38,7 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
     names, cameras = np.array(observations.noise_names), np.array([view.camera for view in observations.views])
     before = np.array([observations.noise.get(name, 1.0) for name in names.tolist()])
     before /= median(np.repeat(before, equations))
-    noise, changes, spare = dict[str, float](), [0.0], 0.0
+    noise, spare = dict[str, float](), 0.0
     for name in dict.fromkeys(names.tolist()):
         own = names == name
         count, shown = int(equations[own].sum()), [observations.views[view] for view in np.flatnonzero(own)]
@@ -52,9 +52,14 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
         relative = [now * length[used & own[view]] for length, used, view in parts]
         squares, freedom = squares_beside(relative, taken_up, problem.options.reject_sigma)
         noise[name], spare = _scale_of_few(squares, freedom), spare + freedom
-        changes.append(abs(float(np.log(noise[name] / now))))
-    # Of fewer the stated sigmas are taken, which is no usual scale: factors of a rig of few clicks grew to 50.
-    return noise if max(changes) > _ALIKE and spare >= LEAST_SPARE else dict(observations.noise)
+    # Only how they differ counts: the scale of all together is estimated with the next solve, and would cancel what is
+    # common to them. Of fewer equations the stated sigmas are taken: factors of a rig of few clicks grew to 50.
+    after = np.array([noise.get(name, np.nan) for name in names.tolist()])
+    usual = median(np.repeat(after, equations))
+    differ = np.abs(np.log(after / usual / before)[equations > 0]) > _ALIKE
+    if spare < LEAST_SPARE or not np.any(differ):
+        return dict(observations.noise)
+    return {name: scale / usual for name, scale in noise.items()}
 
 
 def _scale_of_few(squares: float, freedom: float) -> float:
