@@ -171,9 +171,7 @@ def test_clicks_count_by_their_own_noise_beside_detected_boards() -> None:
         observations, camera = clicked_beside_boards(seed)
         calibration = calibrate(observations)
         assert np.max(radii_of(calibration, camera)) < 2.0, seed  # 1.1
-        noise = calibration.fit.of_cameras
-        assert noise["camera/field"] > 3.0 and not calibration.outliers
-        assert noise["camera/board"] == 1.0  # the usual one: what is common to all does not count
+        assert calibration.fit.of_cameras["camera/field"] > 3.0 and not calibration.outliers
 
 
 def radii_of(calibration: Calibration, camera: Camera) -> Array:

@@ -52,14 +52,12 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
         relative = [now * length[used & own[view]] for length, used, view in parts]
         squares, freedom = squares_beside(relative, taken_up, problem.options.reject_sigma)
         noise[name], spare = _scale_of_few(squares, freedom), spare + freedom
-    # Only how they differ counts: the scale of all together is estimated with the next solve, and would cancel what is
-    # common to them. Of fewer equations the stated sigmas are taken: factors of a rig of few clicks grew to 50.
+    # What is common to all does not count: the scale of all together, estimated with the next solve, would cancel it.
+    # Of fewer equations the stated sigmas are taken: factors of a rig of few clicks grew to 50.
     after = np.array([noise.get(name, np.nan) for name in names.tolist()])
     usual = median(np.repeat(after, equations))
-    differ = np.abs(np.log(after / usual / before)[equations > 0]) > _ALIKE
-    if spare < LEAST_SPARE or not np.any(differ):
-        return dict(observations.noise)
-    return {name: scale / usual for name, scale in noise.items()}
+    changes = (np.abs(np.log(one / before))[equations > 0] > _ALIKE for one in (after, after / usual))
+    return noise if spare >= LEAST_SPARE and all(map(np.any, changes)) else dict(observations.noise)
 
 
 def _scale_of_few(squares: float, freedom: float) -> float:
