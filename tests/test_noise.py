@@ -118,9 +118,7 @@ def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own
         ratios = [floors(run, name)[0] for run in runs]
         assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.2, (name, ratios)  # 0.42 to 1.02; of four 0.68 to 0.78
     noise = runs[0].fit.of_cameras
-    assert noise["c3"] / np.mean([noise[name] for name in ("c0", "c1", "c2")]) == pytest.approx(
-        6.0, rel=0.3
-    )  # 4.7: the mean counts as ten equations
+    assert noise["c3"] / np.mean([noise[name] for name in ("c0", "c1", "c2")]) == pytest.approx(6.0, rel=0.3)  # 7.3
     (words,) = (text for text in runs[0].remarks if "noise differs by more" in text)
     assert "'c3'" in words
     levels = {level for level, text in judge_quality(quality_of(runs[0], noisy(0))).reasons if "noise differs" in text}

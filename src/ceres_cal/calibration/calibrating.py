@@ -98,17 +98,15 @@ def _of_a_camera(failure: CalibrationError, observations: Observations, options:
     cameras without which the others can be calibrated.
     """
     alone = _failing_alone(observations, options)
-    first, left_out = next(iter(alone.values()), failure), list[str]()
+    first, lacking, left_out = next(iter(alone.values()), failure), [*alone], list[str]()
     found: CalibrationError | Calibration = first
     while isinstance(found, CalibrationError):
-        names = [*alone] if alone and not left_out else [found.camera]
-        if len(names) >= len(observations.cameras) or is_bulk(observations):
+        lacking = lacking or ([found.camera] if found.camera else [])
+        if not 0 < len(lacking) < len(observations.cameras) or is_bulk(observations):
             return first
-        for name in names:
-            if name is None:
-                return first
-            left_out.append(name)
+        for name in lacking:
             observations = observations.without_camera(name)
+        left_out, lacking = [*left_out, *lacking], []
         found = attempt(partial(_measured, observations, options, None, None))  # reads: "... 3 other cameras can"
     those, others = ", ".join(map(repr, left_out)), counted(len(observations.cameras), "other camera")
     can = f"{others} can be calibrated if the observations of {those} are left out"
@@ -119,11 +117,13 @@ def _failing_alone(observations: Observations, options: Options) -> dict[str, Ca
     """Return the failures of the cameras of a rig that cannot be calibrated by themselves, and need not see what is
     placed before others. What one camera lacks, the sums of all may hide, and an impossible lens may show it.
     """
-    shown = {name: observations.of_camera(name) for name in observations.cameras}
     failures = dict[str, CalibrationError]()
+    if len(observations.cameras) < 2 or is_bulk(observations):
+        return failures
+    shown = {name: observations.of_camera(name) for name in observations.cameras}
     for name, own in shown.items():
         others = {placement for other, one in shown.items() if other != name for placement in one.placements}
-        if len(shown) < 2 or is_bulk(observations) or others.intersection(own.placements):
+        if others.intersection(own.placements):
             continue
         # reads: "camera 'c1': 11 measured numbers cannot determine 12 unknowns"
         found = attempt(partial(_measured, own, replace(options, priors=own.about_shown(options.priors)), None, None))

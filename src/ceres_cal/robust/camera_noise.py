@@ -20,9 +20,8 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
     The noise differs, for example, in a photograph out of focus, in a camera of fewer pixels or with another detector,
     or in a field that was clicked beside boards that were detected. At the mean noise, the noisiest would seem too
     certain and the others too uncertain. The unknowns of a camera are divided among its observations by number of
-    equations, those of a pose among the observations that show it. The
-    factor of few observations includes that it is hardly known: with the likeliest one alone, 10 of 300 cameras with
-    six to nine clicks beside boards had a place over 2.5 times its 95 % radius off, and now 3 have.
+    equations, those of a pose among the observations that show it. The factor of few observations includes that it is
+    hardly known.
 
     Args:
         problem: weighted by the noise of all together. judged: (N + M,) observations that are not known outliers.
