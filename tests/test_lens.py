@@ -346,6 +346,11 @@ def test_scales_make_coefficients_of_order_one(lens: Lens) -> None:
         assert np.array_equal(scaled, lens.values)
 
 
+def test_a_name_that_another_program_gives_to_a_lens_belongs_to_one_lens() -> None:
+    names = [name for lens in LENSES.values() for name in (lens.kind, *lens.also_called)]
+    assert len({*names}) == len(names) and all(name == name.lower().replace("_", "-") for name in names)
+
+
 def test_lenses_by_name() -> None:
     assert make_lens("radial", (3, 5), {"a5": 1e-12}) == Radial((0.0, 1e-12), (3, 5))
     assert make_lens("brown", coefficients={"p2": 1e-3}) == Brown((0.0, 0.0, 0.0, 1e-3, 0.0))
@@ -357,7 +362,9 @@ def test_lenses_by_name() -> None:
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: make_lens("fisheye"), "there is no lens 'fisheye': choose one of radial, brown, kannala-brandt"),
+        (lambda: make_lens("glass"), "there is no lens 'glass': choose one of radial, brown, kannala-brandt"),
+        (lambda: make_lens("brow"), "there is no lens 'brow': did you mean 'brown'"),
+        (lambda: make_lens("Plumb_Bob"), "there is no lens 'Plumb_Bob': here it is 'brown'"),
         (
             lambda: make_lens("brown", coefficients={"k7": 0.1}),
             "lens 'brown' has no coefficient 'k7': it has k1, k2, p1",

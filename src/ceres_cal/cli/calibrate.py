@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentTypeError
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import diagnostics, scene
-from ceres_cal.base import InputError, replace
+from ceres_cal.base import InputError, naming, replace
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch, whole
 from ceres_cal.cli.terminal import ProgressBar
@@ -27,9 +26,9 @@ _CAMERA, _SOLVE = "the camera", "the solve"
 
 def _lens_kind(name: str) -> str:
     """Check a kind of lens against the table, which is not imported for the default, for help or for wrong usage."""
-    if name != _AUTO and name not in scene.LENSES:
-        known = ", ".join(map(repr, (*scene.LENSES, _AUTO)))
-        raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {known})")
+    if name != _AUTO:
+        with naming("--lens"):
+            scene.make_lens(name)
     return name
 
 

@@ -77,7 +77,7 @@ class Lens(ABC):
 
     Attributes:
         values: the coefficients, in the order of `names` and in the units of the files and reports.
-        kind: its name in files and options.
+        kind: its name in files and options. also_called: its names in other programs, in small letters with dashes.
         acts_on_pixels: whether the coefficients act on radii in pixels, not on directions.
         acts_on_tangents: whether they act on x / z and y / z, each with the power of its order.
         may_fold: whether the model may fold in a corner of the image that nobody observed.
@@ -91,6 +91,7 @@ class Lens(ABC):
 
     values: tuple[float, ...] = ()
     kind: ClassVar[str]
+    also_called: ClassVar[tuple[str, ...]] = ()
     acts_on_pixels: ClassVar[bool] = False
     acts_on_tangents: ClassVar[bool] = False
     may_fold: ClassVar[bool] = True
@@ -330,10 +331,14 @@ def lens_class(kind: str) -> type[Lens]:
     """Return the lens model with a name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none; the message says which lens has this name in other programs.
     """
     if kind not in LENSES:
-        raise InputError(no_such("lens", kind, LENSES))
+        common = str(kind).lower().replace("_", "-")
+        here = [one for one, lens in LENSES.items() if common in lens.also_called]
+        raise InputError(
+            f"there is no lens {kind!r}: here it is {here[0]!r}" if here else no_such("lens", kind, LENSES)
+        )
     return LENSES[kind]
 
 

@@ -25,6 +25,9 @@ class Brown(DecentredLens):
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "brown"
+    also_called: ClassVar[tuple[str, ...]] = (
+        *("brown-conrady", "conrady", "opencv", "full-opencv", "pinhole", "plumb-bob", "radtan", "rational-polynomial"),
+    )
     formulas: ClassVar[str] = "brown"
     acts_on_tangents: ClassVar[bool] = True
     decentring: ClassVar[tuple[str, ...]] = ("p1", "p2")
@@ -77,6 +80,7 @@ class KannalaBrandt(DecentredLens):
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "kannala-brandt"
+    also_called: ClassVar[tuple[str, ...]] = ("fisheye", "opencv-fisheye", "thin-prism-fisheye", "equidistant", "equi")
     formulas: ClassVar[str] = "kannala-brandt"
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"tangential": ("p1", "p2")})
     above: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
