@@ -430,15 +430,24 @@ def test_the_command_says_what_to_do_first(file: str, capsys: pytest.CaptureFixt
     assert main(["advise", file, "--good-enough-mm", "0.1"]) == 0
     text = capsys.readouterr().out
     assert text.startswith(
-        "advice    measure the camera's height to 10 mm: the worst error at 150 mm falls from 52.8 to 2.3 mm"
+        "advice    measure the camera's height to 10 mm: the worst error at 150 mm falls from 53 to 2.3 mm"
     )
-    assert "today     station 'overhead' at 150 mm: worst 52.8 mm at (4.5, -3.0 m), mean 28.7 mm" in text
+    assert "today     station 'overhead' at 150 mm: worst 53 mm at (4.5, -3.0 m), mean 29 mm" in text
     assert "that is still more than the 0.1 mm asked for" in text
     assert "phi of 'overhead' and its height trade off" in text
     assert max(map(len, text.splitlines())) <= 130
     good = replace(advised("whole field, 3 deg"), best=None, then=None, good_enough_mm=60.0)
     (line,) = verdict_lines(good)
-    assert line.startswith("nothing needs to be measured: the worst error at 150 mm is 52.8 mm, and 60 mm are")
+    assert line.startswith("nothing needs to be measured: the worst error at 150 mm is 53 mm, and 60 mm are")
+
+
+@pytest.mark.parametrize("before_mm", [0.0105, 0.0244, 0.105, 0.99, 1.05, 10.4, 104.0])
+def test_what_is_advised_shows_a_gain(before_mm: float) -> None:
+    """Two significant digits differ wherever a tenth is gained; with two decimals it fell "from 0.02 to 0.02 mm"."""
+    best = promise_of(0.899 * before_mm)
+    few = replace(advised("whole field, 3 deg"), before=Errors(before_mm, before_mm), best=best, then=None)
+    fall = re.search(r"falls from (\S+) to (\S+) mm", next(verdict_lines(few)))
+    assert fall is not None and float(fall[2]) < float(fall[1])
 
 
 def test_the_command_for_scripts(file: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ceres_cal import diagnostics, observations, scene
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.words import short
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, command, option
 from ceres_cal.cli.files import read_calibration, station_of
@@ -83,7 +84,7 @@ def _verdict(advice: diagnostics.Advice) -> Iterator[str]:
             left = _mm(advice.promises[0].after.worst_mm)
             yield f"no measurement is worthwhile: {worst} is {_mm(before.worst_mm)}, and {left} at best afterwards"
         return
-    fall = f"{_mm(before.worst_mm).removesuffix(' mm')} to {_mm(best.after.worst_mm)}"
+    fall = f"{short(before.worst_mm)} to {_mm(best.after.worst_mm)}"
     yield f"{best.measurement.words}: {worst} falls from {fall}{_range(best)}"
     yield from (f"  {step}" for step in best.measurement.steps)
     if advice.then is not None:
@@ -103,9 +104,7 @@ def _range(promise: diagnostics.Promise) -> str:
 
 
 def _mm(value: float) -> str:
-    if value == float("inf"):
-        return "unknown"
-    return f"{value:.1f} mm" if value >= 0.95 else f"{value:.2f} mm"
+    return f"{short(value)} mm" if value < float("inf") else short(value)
 
 
 def _promise_data(promise: diagnostics.Promise) -> dict[str, Any]:
