@@ -39,7 +39,8 @@ from ceres_cal.base.files import LIMIT, read_bytes, write_bytes
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main, terminal
-from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.headers import count_pages
+from ceres_cal.detect.images import read_colour, read_grey, read_light
 from ceres_cal.formats import LookupTable
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
@@ -202,6 +203,19 @@ def test_images_that_claim_more_than_they_hold(tmp_path: Path) -> None:
     ):
         (tmp_path / name).write_bytes(content)
         refused(read_grey, tmp_path / name, words)
+
+
+@pytest.mark.parametrize("second, pages", [((48, 64), 3), ((12, 16), 1)])
+def test_pages_of_a_tiff(second: tuple[int, int], pages: int, tmp_path: Path) -> None:
+    """OpenCV reads the first page without a word; a preview of it is no page."""
+    path, other = tmp_path / "stack.tif", np.zeros(second, np.uint8)
+    assert cv2.imwritemulti(str(path), [np.full((48, 64), 9, np.uint8), other, other])
+    assert count_pages(path.read_bytes()) == pages
+    if pages == 1:
+        assert np.all(read_grey(path) == 9)
+        return
+    for read in (read_grey, read_colour, read_light):
+        refused(read, path, "stack.tif: a TIFF of 3 pages, of which one can be read: save each page as a file")
 
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 400), (60000, 1), (1, 60000)])

@@ -39,6 +39,23 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
     return (int(match[1]), int(match[2])) if match else None
 
 
+def count_pages(content: bytes) -> int:
+    """Return the number of pictures in a TIFF that are as large as its first one (smaller ones are previews of it), and
+    1 for other files.
+
+    Raises:
+        struct.error: it is cut short.
+    """
+    order, pages = _ORDERS.get(content[:4], ""), dict[int, list[int]]()
+    at = struct.unpack_from(order + "I", content, 4)[0] if order else 0
+    while at and at not in pages:
+        pages[at] = _tags(content, order, 256, 257, at=at)
+        (count,) = struct.unpack_from(order + "H", content, at)
+        (at,) = struct.unpack_from(order + "I", content, at + 2 + 12 * count)
+    sizes = [*pages.values()]
+    return sizes.count(sizes[0]) if sizes else 1
+
+
 def viewers_turn_deg(content: bytes) -> int:
     """Return the clockwise turn with which a JPEG or TIFF tells viewers to show it: 0, 90, 180 or 270 degrees."""
     notes = content.partition(_EXIF)[2] if content.startswith(b"\xff\xd8\xff") else content
@@ -84,10 +101,12 @@ def _tiff(content: bytes, order: str) -> tuple[int, int]:
     return width, height
 
 
-def _tags(content: bytes, order: str, *wanted: int) -> list[int]:
-    """Return the values of some tags of a TIFF; the largest where a tag occurs twice, 0 where it does not occur."""
+def _tags(content: bytes, order: str, *wanted: int, at: int = 0) -> list[int]:
+    """Return the values of some tags of a TIFF's first page, or of the one whose table begins `at`; the largest where a
+    tag occurs twice, 0 where it does not occur.
+    """
     values = dict.fromkeys(wanted, 0)
-    (start,) = struct.unpack_from(order + "I", content, 4)
+    start = at or struct.unpack_from(order + "I", content, 4)[0]
     (count,) = struct.unpack_from(order + "H", content, start)
     for number in range(count):
         tag, kind = struct.unpack_from(order + "HH", content, start + 2 + 12 * number)

@@ -21,7 +21,7 @@ from ceres_cal.base import (
     read_bytes,
     require_room,
 )
-from ceres_cal.detect.headers import claimed_size
+from ceres_cal.detect.headers import claimed_size, count_pages
 
 _BYTES_PER_PIXEL = 3
 # Shares of a colour sensor's pixels that see blue, green and red.
@@ -95,6 +95,8 @@ def _decoded(path: str | Path, channels: int) -> Image:
     with suppress(cv2.error, struct.error):  # reads: "not an image that OpenCV can read (cut short?) ..."
         if size := claimed_size(content):
             _require_believable(size, len(content), str(path))
+            if (pages := count_pages(content)) > 1:
+                raise InputError(f"{path}: a TIFF of {pages} pages, of which one can be read: save each page as a file")
             packed = np.frombuffer(content, np.uint8)
             image = cv2.imdecode(packed, flags)
             if image is None or image.dtype.itemsize > 2:  # OpenCV does not convert these to grey
