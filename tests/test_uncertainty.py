@@ -297,7 +297,7 @@ def test_a_valley_is_as_wide_across_at_each_node_as_where_it_was_asked() -> None
     """On the floor, except at its ends: with correlated errors it is half as wide again as in the model."""
     known = calibrated(0.0, 7).uncertainty
     posterior, estimate = known.posterior, known.estimate
-    mixture, places = posterior.mixtures["overhead"], located_by("overhead", np.array([[300.0, 300.0]]), 0.0)
+    mixture, places = posterior.mixtures["overhead"], located_by(estimate, "overhead", np.array([[300.0, 300.0]]), 0.0)
     wide = posterior.across.spread.through(places.slopes(estimate, posterior.across.keys))
     assert posterior.by_model is not None
     narrow = posterior.by_model.given(posterior.across.keys).spread.through(
@@ -308,6 +308,17 @@ def test_a_valley_is_as_wide_across_at_each_node_as_where_it_was_asked() -> None
         there = moved(estimate, mixture.keys, step)
         across = own.spread.through(places.slopes(there, own.keys))
         assert np.sqrt(np.trace(across[0]) / np.trace(wide[0])) == pytest.approx(1.0, abs=0.2)
+
+
+def test_beyond_the_lines_a_height_is_known_no_better_than_the_floor() -> None:
+    """A ray that other lenses turn by 200 mm on the floor is as uncertain 150 mm above it: 25 mm was stated there."""
+    known = calibrate(observed(6.0, 2)).uncertainty
+    camera = known.estimate.camera_at("overhead")
+    width, height = camera.image_size
+    corners = np.array([[1.0, 1.0], [width - 2.0, 1.0], [1.0, height - 2.0], [width - 2.0, height - 2.0]])
+    floor, above = (known.located(corners, height_m).radius_95_m for height_m in (0.0, 0.15))
+    assert known.posterior.followed and np.all(floor > 0.1)  # 0.20 to 0.39 measured
+    assert np.all(above > 0.97 * (1.0 - 0.15 / camera.position[2]) * floor)  # 0.985 to 1.01 measured
 
 
 def test_other_lenses_bend_as_the_chosen_one_does() -> None:
@@ -618,7 +629,7 @@ def test_a_place_whose_slopes_nothing_tells_is_unknown() -> None:
     """For example at a fold of the lens in one component of a mixture: infinite, and no warning of NumPy."""
     known = calibrated(3.0).uncertainty
     pixels = np.array([[300.0, 300.0], [640.0, 480.0]])
-    places = located_by("overhead", pixels, 0.0)
+    places = located_by(known.estimate, "overhead", pixels, 0.0)
 
     def slopes(there: Estimate, keys: Sequence[Key]) -> Array:
         return np.asarray(places.slopes(there, keys) * np.array([np.nan, 1.0])[:, None, None])

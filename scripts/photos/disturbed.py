@@ -25,7 +25,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, custom, ssl_field, targets_by_name
 from ceres_cal.simulate import Station
-from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, outcome
+from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, Places, outcome
 from photos.painters import (
     Painter,
     as_farmers_do,
@@ -183,7 +183,7 @@ def came_of(shot: DisturbedShot, asked: Target) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.png"
         cv2.imwrite(str(path), shot.image)
-        return outcome(path, asked, AUTO, (pixels[inside], floor[inside, :2]))
+        return outcome(path, asked, AUTO, Places(pixels[inside], floor[inside, :2]))
 
 
 def disturbed_rows(runs: int, kinds: Sequence[str] = tuple(KINDS)) -> Iterator[Row]:

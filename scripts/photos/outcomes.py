@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.detect.photographs import Auto, Clicks, detect_field
+from ceres_cal.posterior.maps import PointSpread
 from ceres_cal.problem.parameters import Options
 from ceres_cal.report.grounds import judge_quality, promises
 from ceres_cal.report.quality import quality_of
@@ -23,11 +27,19 @@ WRONG = 4.0  # with a larger ratio a calibration is wrong without saying so
 BEYOND, MOST_BEYOND = 1.5, 0.02  # times the 95 % radius, and the share of places that may lie farther off
 
 
+class Places(NamedTuple):
+    """Pixels (N, 2), and the places (N, 2), m, that they show at a height."""
+
+    pixels: Array
+    places: Array
+    height_m: float = 0.0
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Seconds of the detection; mean, median and rms error of the map over the field, mm, and the stated error; the
-    share of places far beyond their 95 % radius; the chosen lens, the verdict on the calibration, and whether it states
-    an accuracy; or the reason of a refusal.
+    share of places far beyond their 95 % radius, on the field and outside it; the chosen lens, the verdict on the
+    calibration, and whether it states an accuracy; or the reason of a refusal.
     """
 
     seconds: float
@@ -36,6 +48,7 @@ class Outcome:
     rms_mm: float = np.nan
     stated_mm: float = np.nan
     beyond: float = np.nan
+    beyond_outside: float = np.nan
     lens: str = ""
     verdict: str = ""
     trusted: bool = False
@@ -52,11 +65,13 @@ class Outcome:
         return self.trusted and (self.over_stated > WRONG or self.beyond > MOST_BEYOND)
 
 
-def outcome(path: Path, asked: Target, start: Auto | Clicks, truth: tuple[Array, Array], lens: str = "auto") -> Outcome:
+def outcome(
+    path: Path, asked: Target, start: Auto | Clicks, truth: Places, lens: str = "auto", outside: Sequence[Places] = ()
+) -> Outcome:
     """Detect, calibrate, and compare with the truth.
 
     Args:
-        truth: pixels (N, 2), and their places on the field (N, 2), m.
+        truth: of the field. outside: of what else the picture shows, at any heights.
     """
     began = time.perf_counter()
     try:
@@ -65,12 +80,22 @@ def outcome(path: Path, asked: Target, start: Auto | Clicks, truth: tuple[Array,
         calibration = calibrate(found.observations, Options(lens=lens))
     except (CalibrationError, InputError) as refusal:
         return Outcome(time.perf_counter() - began, why=str(refusal).partition(": ")[2] or str(refusal))
-    pixels, places = truth
-    error = 1e3 * np.linalg.norm(calibration.station().locate(pixels) - places, axis=1)
-    located = calibration.uncertainty.located(pixels)
+    error, located = _compared(calibration, truth)
     rms, stated = (float(np.sqrt(np.mean(one**2))) for one in (error, 1e3 * located.sd_m))
-    beyond = float(np.mean(error > BEYOND * 1e3 * located.radius_95_m))
+    beyond = float(np.mean(_is_far(error, located)))
+    away = np.concatenate([_is_far(*_compared(calibration, places)) for places in outside] or [np.zeros(0, bool)])
     quality = quality_of(calibration, found.observations)
     said, trusted = judge_quality(quality).headline, promises(quality)
     mean, median = float(np.mean(error)), float(np.median(error))
-    return Outcome(seconds, mean, median, rms, stated, beyond, calibration.options.lens, said, trusted)
+    beside = float(np.mean(away)) if len(away) else np.nan
+    return Outcome(seconds, mean, median, rms, stated, beyond, beside, calibration.options.lens, said, trusted)
+
+
+def _compared(calibration: Calibration, truth: Places) -> tuple[Array, PointSpread]:
+    """Errors (N,) of what pixels show, mm, and what is stated of them."""
+    located = calibration.uncertainty.located(truth.pixels, truth.height_m)
+    return 1e3 * np.linalg.norm(located.located - truth.places, axis=1), located
+
+
+def _is_far(error_mm: Array, located: PointSpread) -> Mask:
+    return np.asarray(error_mm > BEYOND * 1e3 * located.radius_95_m)

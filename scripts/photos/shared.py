@@ -15,16 +15,16 @@ import numpy as np
 from runner import Row, over
 from scipy.interpolate import griddata
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.detect.photographs import Auto, Clicks, Facing
 from ceres_cal.scene.targets import targets_by_name
-from photos.outcomes import MOST_BEYOND, MOVED_MM, STATED, USUAL_MM, Outcome, outcome
+from photos.outcomes import MOST_BEYOND, MOVED_MM, STATED, USUAL_MM, Outcome, Places, outcome
 
 CLICK_PX = 8.0
 _CORNERS = (
     *("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner"),
     *("BottomHalfwayCrossing", "TopHalfwayCrossing"),
 )
+_SEEN = {0.0: "field_m_at_0_mm", 0.15: "field_m_at_150_mm"}  # height, m -> its places in the truth
 _LEAST_AREA = 0.01  # share of the picture, for the triangle of any three clicked places
 _SOUND = 0.9  # share of correct calibrations that must be trusted for something
 ALLOWED_MM = {"combo": MOVED_MM, "camera": MOVED_MM}  # by kind
@@ -54,12 +54,21 @@ class KnownPhotograph:
         mirrored = "mirrored" in self.truth.get("what", "")
         return (*(() if mirrored else ("auto",)), *(("clicks",) if self._shown else ()))
 
-    def floor(self, height: str = "field_m_at_0_mm") -> tuple[Array, Array]:
-        """Pixels (N, 2) that show the field, and their places on it, m."""
-        pixels, places = (np.array(one, dtype=float) for one in self._seen(height))
+    @property
+    def floor(self) -> Places:
+        """What shows the field."""
+        return self._part(0.0, inside=True)
+
+    @property
+    def outside(self) -> tuple[Places, ...]:
+        """What shows anything beside the field, on the floor and above it."""
+        return tuple(self._part(height_m, inside=False) for height_m in _SEEN)
+
+    def _part(self, height_m: float, inside: bool) -> Places:
+        pixels, places = (np.array(one, dtype=float) for one in self._seen(_SEEN[height_m]))
         painted = self.truth["field_as_painted"]
-        inside = np.all(np.abs(places) <= 0.5 * np.array([painted["L"], painted["W"]]), axis=1)
-        return pixels[inside], places[inside]
+        own = np.all(np.abs(places) <= 0.5 * np.array([painted["L"], painted["W"]]), axis=1) == inside
+        return Places(pixels[own], places[own], height_m)
 
     def _seen(self, height: str) -> tuple[Any, ...]:
         every = zip(self.truth["pixels"], self.truth[height], strict=True)
@@ -70,7 +79,7 @@ class KnownPhotograph:
         """Names of four corners or crossings, well apart; those of the outline where they are in the picture."""
         corners, target = self.truth["corners_px"], targets_by_name()[self.truth["asked_as"]]
         if sum(name in corners for name in _CORNERS) < 4:
-            pixels, places = (np.array(one) for one in self._seen("field_m_at_0_mm"))
+            pixels, places = (np.array(one) for one in self._seen(_SEEN[0.0]))
             there = griddata(places, pixels, target.point_array[:, :2])
             corners |= {
                 name: pixel.tolist()
@@ -123,7 +132,7 @@ def shared_rows(folders: Iterable[Path]) -> Iterator[Row]:
 def came_of_known(shown: KnownPhotograph, how: str) -> Outcome:
     """Result for one photograph, started by "auto" or by "clicks"."""
     start = shown.clicks() if how == "clicks" else Auto((Facing(*shown.truth["facing"].split("=")),))
-    return outcome(shown.path, targets_by_name()[shown.truth["asked_as"]], start, shown.floor())
+    return outcome(shown.path, targets_by_name()[shown.truth["asked_as"]], start, shown.floor, outside=shown.outside)
 
 
 def _rows(shown: KnownPhotograph, how: str, came: Outcome) -> Iterator[Row]:
@@ -140,6 +149,9 @@ def _rows(shown: KnownPhotograph, how: str, came: Outcome) -> Iterator[Row]:
         yield Row(case, "rms error over stated", came.over_stated, least=1.0 / STATED, most=STATED)
         note = "trusted" if came.trusted else "not trusted"
         yield Row(case, "share far beyond its 95 % radius", came.beyond, most=MOST_BEYOND, note=note)
+        if came.beyond_outside >= 0.0:
+            what = "share far beyond its 95 % radius, outside the field"
+            yield Row(case, what, came.beyond_outside, most=MOST_BEYOND, note=note)
 
 
 def _of_all(found: Mapping[str, Sequence[Outcome]]) -> Iterator[Row]:

@@ -89,18 +89,26 @@ def spread_of_points(
     """
     station_keys(estimate, posterior, station)
     located = estimate.camera_at(station).locate(pixels, height_m)
-    places = located_by(station, pixels, height_m)
+    places = located_by(estimate, station, pixels, height_m)
     known = read(posterior, estimate, places, estimate.stations[station].camera)
     return PointSpread(located, located + known.low, located + known.high, known.radius_95, known.sd)
 
 
-def located_by(station: str, pixels: Array, height_m: float) -> Functional:
-    """Return the functional of the places at a height that pixels (N, 2) of a station show."""
-    return Functional(
-        lambda there: there.camera_at(station).locate(pixels, height_m),
-        lambda there, keys: locate_slopes(there, keys, station, pixels, height_m),
-        tells_phi=height_m != 0.0,
-    )
+def located_by(near: Estimate, station: str, pixels: Array, height_m: float) -> Functional:
+    """Return the functional of the places at a height that pixels (N, 2) of a station show; `near` gives its height."""
+
+    def values(there: Estimate) -> Array:
+        return there.camera_at(station).locate(pixels, height_m)
+
+    def on_floor(there: Estimate) -> Array:
+        """A ray shows at a height what it shows on the floor, nearer to the camera's foot by this share."""
+        share = height_m / float(near.camera_at(station).position[2])
+        return (1.0 - share) * there.camera_at(station).locate(pixels, 0.0)
+
+    def slopes(there: Estimate, keys: Sequence[Key]) -> Array:
+        return locate_slopes(there, keys, station, pixels, height_m)
+
+    return Functional(values, slopes, values if height_m == 0.0 else on_floor)
 
 
 def _plot(self: FieldMap | ImageMap, ax: Any = None) -> Any:
@@ -202,7 +210,7 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     station_keys(estimate, posterior, station)
     pixels, camera = visible_pixels(estimate, station, grid.places, grid.height_m), estimate.stations[station].camera
     visible = np.isfinite(pixels[:, 0])
-    known = read(posterior, estimate, located_by(station, pixels[visible], grid.height_m), camera)
+    known = read(posterior, estimate, located_by(estimate, station, pixels[visible], grid.height_m), camera)
     return FieldMap.of_visible(grid, station, visible, known.sd, known.radius_95)
 
 
@@ -337,12 +345,12 @@ class Functional(Frozen):
     Attributes:
         values: returns (N, 2) at an estimate; NaN where nothing is shown. slopes: returns (N, 2, K) at an estimate, by
             some keys (K).
-        tells_phi: whether it changes with phi along a valley; places on the floor do not.
+        on_floor: returns (N, 2) the part of the values that phi does not change along a valley; None: there is none.
     """
 
     values: Callable[[Estimate], Array]
     slopes: Callable[[Estimate, Sequence[Key]], Array]
-    tells_phi: bool = True
+    on_floor: Callable[[Estimate], Array] | None = None
 
 
 def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: str = "") -> Reading:
@@ -365,19 +373,20 @@ def _of_components(
 
     Values with another lens differ from those of the same component with the chosen lens as the lens does, wherever it
     shows anything. What changes along a valley changes with a lens's phi, too, which the valley already includes: there
-    the numbers of the component are used.
+    the numbers of the component say it, and the lens says only what it shows on the floor.
     """
     here, known = shown.values(estimate), dict[int, Array]()
     values = np.full((len(mixture.at), *here.shape), np.nan)
-    as_lenses = {} if mixture.is_followed and shown.tells_phi else mixture.lenses
-    off = [shown.values(lens) - shown.values(lenses[0]) for lens in lenses] if as_lenses else []
+    part = shown.on_floor if mixture.is_followed else shown.values
+    as_lenses = {} if part is None else mixture.lenses
+    off = [part(lens) - part(lenses[0]) for lens in lenses] if part and as_lenses else []
 
     def there(component: int) -> Estimate:
         step = mixture.steps[component]
         return moved(estimate, mixture.keys, step) if np.any(step) else estimate
 
     for component, number in enumerate(mixture.at.tolist()):
-        like_lens = np.isfinite(off[as_lenses[component][0]]).all() if component in as_lenses else False
+        like_lens = part is shown.values and component in as_lenses and np.isfinite(off[as_lenses[component][0]]).all()
         if like_lens and number in known:
             continue
         near = estimate
@@ -388,7 +397,12 @@ def _of_components(
             far = width if mixture.is_followed else 0.0
             known[number] = _covariance(mixture.information[number], near, shown, far)
     for component, (lens, alike) in as_lenses.items():
-        values[component] = np.where(np.isfinite(off[lens]), values[alike] + off[lens], values[component])
+        as_lens = values[alike]
+        if part and part is not shown.values:
+            as_lens = np.full_like(here, np.nan)
+            with suppress(InputError):  # reads: "unknown" at these places of the map
+                as_lens = values[component] - part(there(component)) + part(there(alike))
+        values[component] = np.where(np.isfinite(off[lens]), as_lens + off[lens], values[component])
     return values, np.array([known[number] for number in mixture.at.tolist()])
 
 

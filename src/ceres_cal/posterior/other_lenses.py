@@ -265,7 +265,7 @@ def _shown(keys: Sequence[Key], near: Estimate, pixels: Mapping[str, Array]) -> 
         for station in stations:
             px_per_m = near.cameras[name].phi / max(abs(float(near.camera_at(station).position[2])), 1e-3)
             for height_m, part in zip(HEIGHTS_M[: 2 if tells_phi else 1], _PARTS, strict=False):
-                yield part * px_per_m, located_by(station, places, height_m)
+                yield part * px_per_m, located_by(near, station, places, height_m)
         if not stations:
             yield 1.0, shown_by(name, Picture(near.cameras[name].at(Pose.identity()), places))
 

@@ -111,7 +111,7 @@ def predicted(
         station_keys(estimate, posterior, station)
         pixels.append(visible_pixels(estimate, station, places, height_m))
     visible = np.isfinite(pixels[0][:, 0]) & np.isfinite(pixels[1][:, 0])
-    first, second = (located_by(name, own[visible], height_m) for name, own in zip(pair, pixels, strict=True))
+    first, second = (located_by(estimate, name, own[visible], height_m) for name, own in zip(pair, pixels, strict=True))
     seam = Functional(
         lambda there: first.values(there) - second.values(there),
         lambda there, keys: first.slopes(there, keys) - second.slopes(there, keys),
