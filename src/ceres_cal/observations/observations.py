@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Indices, Indices32, InputError, Mask, cached_property, checked, field, naming, replace
-from ceres_cal.base.words import no_such, plural, printable
+from ceres_cal.base.words import no_such, plural
 from ceres_cal.observations.columns import (
     Columns,
     Curves,
@@ -30,7 +30,7 @@ from ceres_cal.observations.columns import (
     view_label,
 )
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
-from ceres_cal.observations.validation import Copies, find_copies, odd_sizes, require_alike, stray_pixels
+from ceres_cal.observations.validation import Copies, find_copies, odd_sizes, require_alike, require_names, stray_pixels
 from ceres_cal.scene.targets import Target
 
 _NAMES = attrgetter("camera", "station", "target", "placement")
@@ -327,10 +327,8 @@ class Observations(Content):
                 or (placement is not None and placed.setdefault(placement, target) != target)
             ):
                 raise InputError(self._odd_view(number, owner, placed))
-        frames = {view.frame: None for view in self.views}
-        for what, names in (("camera", self.cameras), ("target", self.targets), ("frame", frames), ("station", owner)):
-            _require_letters(what, names)
-        _require_letters("placement", placed)
+        names = {"camera": self.cameras, "target": self.targets, "station": owner, "placement": placed}
+        require_names({**names, "frame": {view.frame: None for view in self.views}})
 
     def _odd_view(self, number: int, owner: Mapping[str, str], placed: Mapping[str, str]) -> str:
         """Describe a view's error. owner, placed: camera of each station and target of each placement before it."""
@@ -438,12 +436,3 @@ def combine(parts: Sequence[Observations]) -> Observations:
         joined([replace(part.curves, view=part.curves.view + start) for part, start in each]),
         tuple(dict.fromkeys(prior for part in parts for prior in part.priors)),
     )
-
-
-def _require_letters(what: str, names: Iterable[str]) -> None:
-    """Raise InputError where a name is not UTF-8, as arguments of a command line may be; no file could hold it."""
-    try:
-        "".join(names).encode()
-    except UnicodeEncodeError:
-        odd = next(name for name in names if name != printable(name))
-        raise InputError(f"{what} '{printable(odd)}': a name must be UTF-8: give another one") from None

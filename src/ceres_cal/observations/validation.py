@@ -14,12 +14,13 @@ copy: a static camera and a detector of whole pixels may well produce it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, first_of, median, numbers_of
+from ceres_cal.base.words import printable
 from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, in_blocks, view_label
 from ceres_cal.observations.files import Content
 
@@ -37,6 +38,23 @@ _REMOTE_M = 1e5
 # Largest ratio of the sigmas: from ten pixels for a click to a thousandth of a pixel for a large target in the image.
 # Beyond it one observation decides alone, and nothing contradicts it.
 _SIGMA_RATIO = 1e4
+
+
+def require_names(names: Mapping[str, Iterable[str]]) -> None:
+    """Raise InputError where a name is not UTF-8, as arguments of a command line may be (no file could hold it), or
+    where that of a camera or target contains "/": noise has names "camera/target", and numbers "target/feature".
+
+    Args:
+        names: by what has them.
+    """
+    for what, every in names.items():
+        text = "".join(every)
+        if text != printable(text):
+            odd = next(printable(name) for name in every if name != printable(name))
+            raise InputError(f"{what} '{odd}': a name must be UTF-8: give another one")
+        if "/" in text and what in ("camera", "target"):
+            odd = next(name for name in every if "/" in name)
+            raise InputError(f"{what} {odd!r}: '/' separates names and must not be in one: give another one")
 
 
 def require_alike(content: Content) -> None:
