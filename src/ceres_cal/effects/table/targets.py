@@ -277,13 +277,13 @@ def _has_floor(observations: Observations) -> bool:
 def _of_floor(
     kind: str, columns: Callable[[Case], EffectColumns], words: Callable[[Evidence], Words], **more: Any
 ) -> Effect:
-    """An effect of floors, where there are any."""
+    """An effect of floors: it has columns, and concerns observations, only where there are any."""
 
     def over(case: Case) -> Iterator[EffectColumns]:
         if _has_floor(case.problem.observations):
             yield columns(case)
 
-    return Effect(kind, over, words, absorbed=True, **more)
+    return Effect(kind, over, words, absorbed=True, concerns=_has_floor, **more)
 
 
 def _has_few_boards(observations: Observations) -> bool:
@@ -319,7 +319,7 @@ BOARD_STRETCHED = _of_target(
     concerns=_has_few_boards,
 )
 """A board is printed longer one way than the other."""
-_of_whole_floor = partial(_of_floor, prior=FLOOR_OFF, reach=_reach_m, concerns=_has_floor)
+_of_whole_floor = partial(_of_floor, prior=FLOOR_OFF, reach=_reach_m)
 EFFECTS = (
     _of_whole_floor("floor bowed", _bowed, _of_bow),
     _of_floor("floor uneven", _uneven, _of_place),
