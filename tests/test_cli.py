@@ -157,14 +157,21 @@ def test_examples_in_the_help(say: Say, name: str) -> None:
 
 @pytest.mark.parametrize(
     "text, unit, value",
-    [("0.15", "m", 0.15), ("150", "mm", 150.0), ("150mm", "m", 0.15), ("0.15 m", "mm", 150.0), ("2.5cm", "mm", 25.0)],
+    [
+        ("0.15", "m", 0.15),
+        ("150", "mm", 150.0),
+        ("150mm", "m", 0.15),
+        ("0.15 m", "mm", 150.0),
+        ("2.5cm", "mm", 25.0),
+        ("0.1km", "m", 100.0),
+    ],
 )
 def test_lengths_say_their_unit_or_have_that_of_the_option(text: str, unit: str, value: float) -> None:
     assert parse_length(text, "here", unit) == pytest.approx(value, rel=1e-15)
     assert length(unit)(text) == pytest.approx(value, rel=1e-15)
 
 
-@pytest.mark.parametrize("text", ["", "m", "5km", "5 m m", "nanmm", "5,3m"])
+@pytest.mark.parametrize("text", ["", "m", "5yd", "5 m m", "nanmm", "5,3m"])
 def test_what_is_no_length(text: str) -> None:
     with pytest.raises(InputError, match="here"):
         parse_length(text, "here")

@@ -642,7 +642,8 @@ def test_a_name_that_no_file_can_hold(what: str) -> None:
             5.8e6,
             "target 'target' lies 5800 km from its coordinate origin, which loses precision: use an ",
         ),
-        (1e3, 0.0, "target 'target' is 18028 m large: are its numbers metres, or millimetres?"),
+        (1e2, 0.0, "target 'target' is 1803 m large: are its numbers metres, not cm or mm?"),
+        (1e3, 0.0, "target 'target' is 18028 m large: are its numbers metres, not cm or mm?"),
     ],
 )
 def test_sizes_that_are_odd(unit: float, origin_m: float, said: str) -> None:

@@ -155,6 +155,13 @@ def test_what_makes_no_field(spec: dict[str, object], message: str) -> None:
         target_from_spec(spec, "here")
 
 
+@pytest.mark.parametrize("unit, in_a_metre", [("mm", 1e3), ("cm", 1e2), ("km", 1e-3), ("inch", 39.37), ("ft", 3.281)])
+def test_dimensions_in_another_unit_are_refused(unit: str, in_a_metre: float) -> None:
+    spec = {"kind": "ssl-field", "field_length_m": 9.0 * in_a_metre, "field_width_m": 6.0 * in_a_metre}
+    with pytest.raises(InputError, match=f"its dimensions are in {unit}, it seems: give them in metres"):
+        target_from_spec({**spec, "division": "B"}, "here")
+
+
 def test_a_court_is_calibrated_over(tmp_path: Path) -> None:
     """From observations of a template to a camera, through files and the command line."""
     court = painted_field("vss-field", "3v3")

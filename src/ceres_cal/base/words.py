@@ -12,7 +12,7 @@ from pathlib import PurePath
 
 DASH = "\N{EN DASH}"
 _SPACE = "\N{NO-BREAK SPACE}"
-IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "inch": 1.0 / 0.0254, "ft": 1.0 / 0.3048}
+IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "km": 0.001, "inch": 1.0 / 0.0254, "ft": 1.0 / 0.3048}
 """Number of each unit of length in a metre."""
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

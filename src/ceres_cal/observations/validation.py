@@ -197,13 +197,13 @@ def _within(content: Content, reach: Mapping[str, Array], corner: float) -> list
 
 
 def odd_sizes(content: Content) -> Iterator[str]:
-    """Yield one line for each target so large that its numbers may be millimetres, or so far from their origin that
+    """Yield one line for each target so large that its numbers may be mm or cm, or so far from their origin that
     digits are lost.
     """
     for name, target in content.targets.items():
         size_m = float(np.linalg.norm(np.ptp(target.places, axis=0)))
         if size_m > _LARGE_M:
-            yield f"target {name!r} is {size_m:.0f} m large: are its numbers metres, or millimetres?"
+            yield f"target {name!r} is {size_m:.0f} m large: are its numbers metres, not cm or mm?"
         elif target.reach_m > _REMOTE_M:
             away = f"{1e-3 * target.reach_m:.0f} km from its coordinate origin"
             yield f"target {name!r} lies {away}, which loses precision: use an origin near it"
