@@ -21,6 +21,7 @@ from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
 from ceres_cal.observations import Observations, Prior, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.bundle import Progress, _left_to_gain, solve
+from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import (
     Chart,
     Estimate,
@@ -32,8 +33,9 @@ from ceres_cal.problem.parameters import (
     make_layout,
     with_intrinsics,
 )
-from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import intrinsic_keys
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial
@@ -376,3 +378,33 @@ def test_what_ceres_moves_says_the_same_in_other_numbers(phi: float, values: lis
     np.testing.assert_allclose(chart.chained(np.eye(len(free)), numbers), np.array(slopes).T, rtol=1e-6, atol=1e-9)
     assert chart_of(seen_by, np.array([1, 2, 4, 5])) is None  # phi is held
     assert chart_of(replace(seen_by, lens=Radial((0.1, 0.1))), free) is None  # which acts on pixels
+
+
+# ---- parts of a rig -------------------------------------------------------------------------------------------------
+
+
+def test_cameras_that_share_nothing_are_solved_for_one_by_one() -> None:
+    """Each part ends where the solve of all ends, and holds the other camera; priors and boards tie cameras."""
+    cameras, stations = scenes.side_by_side(scenes.camera("radial-2-3"))
+    above = simulate(field_scene(ssl_field("B"), cameras, stations, spacing_m=0.3), NOISE, 3).observations
+    options = Options(lens="radial", usual_camera=False)
+    start = initialise(gather_sights(above), options).estimate
+    problem = problem_of(above, options, Weighting(loss="cauchy"), start)
+    whole = solve(problem, start).estimate
+    parts = [problem.about(name, start) for name in cameras]
+    assert sum(part.equations for part in parts) == problem.equations
+    for name, part in zip(cameras, parts, strict=True):
+        end, other = solve(part, start).estimate, next(key for key in cameras if key != name)
+        assert (end.cameras[other], end.stations[other]) == (start.cameras[other], start.stations[other])
+        alone = replace(whole, cameras={**whole.cameras, other: start.cameras[other]})
+        alone = replace(alone, stations={**whole.stations, other: start.stations[other]})
+        assert distance(end, alone) < 1e-6  # 1e-7 measured, where Cauchy's loss ends
+
+    both = GaussianPrior(Information(intrinsic_keys("left", cameras["left"].lens)[:1], np.eye(1)), np.zeros(1))
+    keys = tuple(intrinsic_keys(name, cameras[name].lens)[0] for name in cameras)
+    tied = GaussianPrior(Information(keys, np.ones((2, 2))), np.zeros(2))
+    assert replace(problem, priors=(both,)).about("left", start).equations == parts[0].equations
+    assert replace(problem, priors=(tied,)).about("left", start).equations == problem.equations
+    seen, named = case(f"{scenes.LENSES[0]}/two-cameras")
+    shared = problem_of(seen, named, Weighting(), start_of(f"{scenes.LENSES[0]}/two-cameras"))
+    assert shared.about("west", start_of(f"{scenes.LENSES[0]}/two-cameras")) is shared

@@ -79,7 +79,8 @@ def assess(
         camera = estimate.cameras[name]
         if is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
-        nodes = valleys[name] = valley(name, astray, estimate, _inflation(posterior, name), width)
+        alone = astray.about(name, estimate)
+        nodes = valleys[name] = valley(name, alone, estimate, _inflation(posterior, name), width)
         rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
         if not is_lens(camera) or rise < width**2:
             estimate = _usual(name, nodes)

@@ -277,29 +277,45 @@ def ends_of(
     axes = weak_axes(information, estimate, keys)
     if not axes.shape[1]:
         return None
-    least = 2.0 * solve(problem, estimate).cost
     few, others = problem.sights.equations < FEW, list[Solution]()
+    parts = [_part_along(problem, estimate, keys, axis / sizes) for axis in axes.T]
+    costs = {id(part): 2.0 * solve(part, estimate).cost for part in parts}
     steps, excesses = [], []
     for sign in (half_width, -half_width):
-        for axis in axes.T:
+        for part, axis in zip(parts, axes.T, strict=True):
+            least = costs[id(part)]
             slopes = axis / sizes**2 / float(np.sum((axis / sizes) ** 2))
             # The cost rises by the model's information, which is larger than that with the scatter of the data.
             rise = half_width**2 / float(slopes @ by_model.spread.covariance @ slopes)
             along, step = sign * axis, sign * (information.spread.covariance @ slopes) / sizes
-            end = _end(problem, estimate, keys, along)
+            end = _end(part, estimate, keys, along)
             found = [_excess(end, step, least, rise)]
-            far = _end(problem, estimate, keys, far_out * along) if few else None
+            far = _end(part, estimate, keys, far_out * along) if few else None
             if far is not None:
-                if (other := solved_soon(problem, far.estimate)) is not None:
+                if (other := solved_soon(part, far.estimate)) is not None:
                     others.append(replace(other, cost=other.cost - 0.5 * least))
                 # Where the cost rises ever more slowly, the interval ends between; a far end alone decides nothing.
                 nearer = far_out * _reach(far, least, rise)
                 if nearer > 1.0:
-                    found.append(_excess(_end(problem, estimate, keys, nearer * along), step, least, rise, nearer))
+                    found.append(_excess(_end(part, estimate, keys, nearer * along), step, least, rise, nearer))
             steps.append(step)
             excesses.append(max(found, key=lambda one: float(np.linalg.norm(np.clip(one, -1.0, 1.0)))))
     reached = np.array(steps)
     return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, tuple(others))
+
+
+def _part_along(problem: Problem, estimate: Estimate, keys: Sequence[Key], axis: Array) -> Problem:
+    """Return the part of a problem that moves along an axis (K,), in natural sizes; all of it where cameras move that
+    depend on one another.
+    """
+    alone = 0.01  # share of other cameras in an axis: they have some scatter in common, but no curvature
+    most = keys[int(np.argmax(np.abs(axis)))]
+    camera = most.owner if most.kind == "camera" else estimate.stations[most.owner].camera
+    part = problem.about(camera, estimate)
+    free = {("camera", name) for name, numbers in part.layout.free.items() if len(numbers)}
+    free |= {("station", name) for name in part.layout.stations}
+    others = axis[[key[:2] not in free for key in keys]]
+    return part if float(others @ others) < alone * float(axis @ axis) else problem
 
 
 class _End(Frozen):

@@ -173,6 +173,32 @@ class Problem(Frozen):
         sights = self.sights.take(numbers)
         return replace(self, sights=sights, layout=self.layout.of(sights.keys))
 
+    def about(self, camera: str, estimate: Estimate) -> Problem:
+        """The part on which a camera's numbers depend, with everything else held: cameras of a rig that share neither
+        placements, nor priors, nor the structure of targets are calibrated as if there were no others.
+        """
+        if len(self.layout.free) < 2 or self.elsewhere is not None or len(estimate.structure.values):
+            return self
+        of_station = {name: station.camera for name, station in estimate.stations.items()}
+        together = [
+            {key.owner if key.kind == "camera" else of_station.get(key.owner, "") for key in prior.keys}
+            for prior in self.priors
+        ]
+        seen = dict[str | None, set[str]]()
+        for key in self.sights.keys:
+            seen.setdefault(key.placement, set()).add(key.camera)
+        together += [cameras for placement, cameras in seen.items() if placement in self.layout.placements]
+        linked, before = {camera}, set[str]()
+        while linked != before:
+            before, linked = linked, linked.union(*(cameras for cameras in together if cameras & linked))
+        if linked >= {*self.layout.free}:
+            return self
+        part = self.of_sights(np.flatnonzero([key.camera in linked for key in self.sights.keys]))
+        nothing = np.zeros(0, dtype=np.int64)
+        free = {name: numbers if name in linked else nothing for name, numbers in self.layout.free.items()}
+        stations = frozenset(name for name in self.layout.stations if of_station[name] in linked)
+        return replace(part, layout=replace(part.layout, free=free, stations=stations))
+
     def holding(self, camera: str, number: int) -> Problem:
         """The problem with one of a camera's intrinsics held; `number`: its index in the solver's vector."""
         return replace(self, layout=self.layout.holding(camera, number))
