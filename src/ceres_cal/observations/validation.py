@@ -42,7 +42,7 @@ _SIGMA_RATIO = 1e4
 
 def require_names(names: Mapping[str, Iterable[str]]) -> None:
     """Raise InputError where a name is not UTF-8, as arguments of a command line may be (no file could hold it), or
-    where that of a camera or target contains "/": noise has names "camera/target", and numbers "target/feature".
+    where that of a target contains "/": its numbers have names "target/feature". Cameras of ROS are "pair/left".
 
     Args:
         names: by what has them.
@@ -52,9 +52,9 @@ def require_names(names: Mapping[str, Iterable[str]]) -> None:
         if text != printable(text):
             odd = next(printable(name) for name in every if name != printable(name))
             raise InputError(f"{what} '{odd}': a name must be UTF-8: give another one")
-        if "/" in text and what in ("camera", "target"):
+        if "/" in text and what == "target":
             odd = next(name for name in every if "/" in name)
-            raise InputError(f"{what} {odd!r}: '/' separates names and must not be in one: give another one")
+            raise InputError(f"target {odd!r}: '/' separates a target from its features: give a name without it")
 
 
 def require_alike(content: Content) -> None:
