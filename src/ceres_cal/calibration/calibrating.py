@@ -97,9 +97,10 @@ def _of_a_camera(failure: CalibrationError, observations: Observations, options:
     """Return the failure of the first camera that fails by itself, too, or else the same one; its message ends with the
     cameras without which the others can be calibrated.
     """
-    alone = _failing_alone(observations, options)
-    first, lacking, left_out = next(iter(alone.values()), failure), [*alone], list[str]()
-    found: CalibrationError | Calibration = first
+    alone = _alone(observations, options)
+    failing = {name: one for name, one in alone.items() if one is not None}
+    first, lacking, left_out = next(iter(failing.values()), failure), [*failing], list[str]()
+    found: CalibrationError | Calibration | None = first
     while isinstance(found, CalibrationError):
         lacking = lacking or ([found.camera] if found.camera else [])
         if not 0 < len(lacking) < len(observations.cameras) or is_bulk(observations):
@@ -107,17 +108,19 @@ def _of_a_camera(failure: CalibrationError, observations: Observations, options:
         for name in lacking:
             observations = observations.without_camera(name)
         left_out, lacking = [*left_out, *lacking], []
-        found = attempt(partial(_measured, observations, options, None, None))  # reads: "... 3 other cameras can"
+        found = None
+        if not {*observations.cameras} <= {*alone}:  # else each of the others was calibrated by itself
+            found = attempt(partial(_measured, observations, options, None, None))  # reads: "... 3 other cameras can"
     those, others = ", ".join(map(repr, left_out)), counted(len(observations.cameras), "other camera")
     can = f"{others} can be calibrated if the observations of {those} are left out"
     return type(first)(f"{first}; {can}", first.camera)
 
 
-def _failing_alone(observations: Observations, options: Options) -> dict[str, CalibrationError]:
-    """Return the failures of the cameras of a rig that cannot be calibrated by themselves, and need not see what is
-    placed before others. What one camera lacks, the sums of all may hide, and an impossible lens may show it.
+def _alone(observations: Observations, options: Options) -> dict[str, CalibrationError | None]:
+    """Return for each camera of a rig that need not see what is placed before others why it cannot be calibrated by
+    itself; None where it can. What one camera lacks, the sums of all may hide, and an impossible lens may show it.
     """
-    failures = dict[str, CalibrationError]()
+    failures = dict[str, CalibrationError | None]()
     if len(observations.cameras) < 2 or is_bulk(observations):
         return failures
     shown = {name: observations.of_camera(name) for name in observations.cameras}
@@ -127,6 +130,7 @@ def _failing_alone(observations: Observations, options: Options) -> dict[str, Ca
             continue
         # reads: "camera 'c1': 11 measured numbers cannot determine 12 unknowns"
         found = attempt(partial(_measured, own, replace(options, priors=own.about_shown(options.priors)), None, None))
+        failures[name] = None
         if isinstance(found, CalibrationError):
             failures[name] = type(found)(str(found) if repr(name) in str(found) else f"camera {name!r}: {found}", name)
     return failures
