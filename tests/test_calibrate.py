@@ -639,7 +639,7 @@ def test_a_height_in_metres_over_a_target_in_millimetres(most: int, height_m: fl
     pixels[~seen | (np.cumsum(seen) > most)] = np.nan
     places = custom({name: (1e3 * x, 1e3 * y, 0.0) for name, (x, y, _) in field.points.items()})
     tape = Prior("station", "camera", "height_m", (height_m,), (0.02,))
-    with pytest.raises((DegenerateError, SolutionError), match="m large: are its numbers metres, or"):
+    with pytest.raises((DegenerateError, SolutionError), match="m large: are its numbers metres, not cm"):
         calibrate(Observations.from_points(pixels, places, (1280, 960)), Options(priors=(tape,)))
 
 
