@@ -173,10 +173,10 @@ def _lie(row: Mapping[str, Any]) -> str:
     if row["scale"] != 1.0:
         return f"{row['notices']}; lengths {row['scale']:g} times"
     if row.get("sds", 0.0) > WRONG_SDS:
-        return f"{row['notices']}; **wrong by {_figure(row['sds'], 2)} sd**"
+        return f"{row['notices']}; wrong by {_figure(row['sds'], 2)} sd"
     if "stated_px" in row:
-        return f"{row['notices']}; **wrong by {_figure(row['off_px'], 2)} px, states {_figure(row['stated_px'], 2)}**"
-    return f"{row['notices']}; **wrong**, states nothing"
+        return f"{row['notices']}; wrong by {_figure(row['off_px'], 2)} px, states {_figure(row['stated_px'], 2)}"
+    return f"{row['notices']}; wrong, states nothing"
 
 
 def counts(found: _Found) -> list[str]:
@@ -189,7 +189,7 @@ def counts(found: _Found) -> list[str]:
         noticed = sum(row["notices"] != "no" for row in own)
         silent = sum(row["notices"] == "no" and row["wrong"] for row in own)
         lines.append([TITLES[peer], str(named), str(noticed), str(silent)])
-    return _table(["of ten", "named", "noticed in any way", "wrong without a word"], lines)
+    return _table(["of ten", "named", "noticed in any way", "wrong without a message"], lines)
 
 
 # ---- the page -------------------------------------------------------------------------------------------------------
