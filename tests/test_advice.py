@@ -323,6 +323,14 @@ def test_promises_are_ranked_and_a_second_step_brings_more() -> None:
     assert advice.then.measurement.kind != advice.best.measurement.kind
 
 
+def test_noise_of_a_camera_is_its_own() -> None:
+    """Camera "a/b" has names that begin like those of camera "a"."""
+    calibration = calibrated("whole field, 8 deg")
+    fit = replace(calibration.fit, of_cameras={"a/field": 2.0, "a/b/field": 5.0})
+    (two, five, one) = (_weighting(fit, camera).point_scale for camera in ("a", "a/b", "c"))
+    assert (two / one, five / one) == pytest.approx((2.0, 5.0))
+
+
 def promise_of(worst_mm: float) -> Promise:
     return Promise(Measurement("tape", ""), Errors(worst_mm, 0.5 * worst_mm))
 

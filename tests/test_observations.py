@@ -615,9 +615,23 @@ def test_a_slash_is_in_names_of_cameras_but_not_of_targets() -> None:
     seen = Points(np.zeros(1, np.int32), np.zeros(1, np.int32), np.full((1, 2), 9.0), np.ones(1))
     nothing = Curves(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.ones(0), np.zeros(0, np.int8))
     sizes = {"pair/left": (640, 480)}
-    assert Observations({"field": ssl_field("B")}, sizes, (one,), seen, nothing).noise_names == ("pair/left",)
+    assert Observations({"field": ssl_field("B")}, sizes, (one,), seen, nothing).noise_names == ("pair/left/field",)
     with pytest.raises(InputError, match=r"^target 'a/b': '/' separates a target from its features"):
         Observations({"a/b": ssl_field("B")}, sizes, (other,), seen, nothing)
+
+
+def test_each_camera_and_target_has_a_noise_of_its_own() -> None:
+    """The noise of target "b" of camera "a" and that of a camera "a/b" had one name."""
+    pairs = [("a", "b"), ("a", "field"), ("a/b", "field"), ("c", "field")]
+    views = tuple(View("f", camera, camera, target, None) for camera, target in pairs)
+    number = np.arange(4, dtype=np.int32)
+    seen = Points(number, np.zeros(4, np.int32), np.full((4, 2), 9.0), np.ones(4))
+    nothing = Curves(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.ones(0), np.zeros(0, np.int8))
+    targets = {"field": ssl_field("B"), "b": ssl_field("A")}
+    observations = Observations(targets, dict.fromkeys(("a", "a/b", "c"), (640, 480)), views, seen, nothing)
+    assert observations.noise_names == ("a/b", "a/field", "a/b/field", "c")
+    noise = dict(zip(observations.noise_names, (2.0, 3.0, 5.0, 7.0), strict=True))
+    assert observations.at_noise(noise).points.sigma_px.tolist() == [2.0, 3.0, 5.0, 7.0]
 
 
 @pytest.mark.parametrize("what", ["camera", "station", "frame"])

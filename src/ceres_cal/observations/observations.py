@@ -257,10 +257,10 @@ class Observations(Content):
     @property
     def noise_names(self) -> tuple[str, ...]:
         """(V,) names of the noise of each view: its camera, or "camera/target" if the camera sees several targets,
-        which may be clicked and detected.
+        which may be clicked and detected, or has "/" in its own name, so that no two have one name.
         """
         seen = {(view.camera, view.target) for view in self.views}
-        several = {name for name, count in Counter(camera for camera, _ in seen).items() if count > 1}
+        several = {name for name, count in Counter(camera for camera, _ in seen).items() if count > 1 or "/" in name}
         return tuple(_with_target(view) if view.camera in several else view.camera for view in self.views)
 
     def at_noise(self, noise: Mapping[str, float]) -> Observations:

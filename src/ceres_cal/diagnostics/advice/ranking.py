@@ -180,7 +180,7 @@ def _weighting(fit: Fit, camera: str) -> Weighting:
     points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
         raise InputError("the calibration's noise is 0, so advice is impossible: use measured pixels")
-    own = max((factor for name, factor in fit.of_cameras.items() if f"{name}/".startswith(f"{camera}/")), default=1.0)
+    own = max((one for name, one in fit.of_cameras.items() if camera in (name, name.rpartition("/")[0])), default=1.0)
     return Weighting(own * points, own * curves, "trivial")
 
 
