@@ -258,16 +258,37 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
         coupling: (m, n) between the others and them.
         others: (m, m) information about the others. limits: (m,) of the others, see `Spread.of`.
     """
-    residue = 1e-11  # what a Schur complement leaves of an unknown direction, relative to the input
+    residue = 1e-11  # what the difference below leaves of an unknown direction, relative to the input
     told = np.flatnonzero(np.diagonal(here) > 0.0)  # nothing is known of the rest
-    coupling = coupling[:, told]
-    left = here[np.ix_(told, told)] - coupling.T @ known_inverses(others, limits) @ coupling
-    scale = np.sqrt(np.diagonal(here)[told])
-    values, vectors = np.linalg.eigh(0.5 * (left + left.T) / scale[:, None] / scale)
-    root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) * scale[:, None]  # the rest is rounding
+    own, coupling = here[np.ix_(told, told)], coupling[:, told]
+    size, scaled = _scaled(others, limits)
+    inverse = _regular_inverses(scaled)
+    if inverse is None:
+        root = _root_without(own, coupling, others, limits)
+    else:
+        left = own - coupling.T @ (inverse * size[:, None] * size) @ coupling
+        scale = np.sqrt(np.diagonal(own))
+        values, vectors = np.linalg.eigh(0.5 * (left + left.T) / scale[:, None] / scale)
+        root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) * scale[:, None]  # the rest is rounding
     whole = np.zeros_like(here)
     whole[np.ix_(told, told)] = root @ root.T
     return whole
+
+
+def _root_without(here: Array, coupling: Array, others: Array, limits: Array) -> Array:
+    """(n, R) root of the Schur complement: of a root of the whole matrix, with the rows of the others projected out.
+
+    Where a direction of the others is nearly unknown, the difference of the matrices themselves is mostly rounding: of
+    a rig with an undetermined camera, another camera's height seemed known to 0.05 m instead of 0.46 m.
+    """
+    count = len(here)
+    whole = np.block([[here, coupling.T], [coupling, others]])
+    scale, scaled = _scaled(whole, np.concatenate([np.full(count, np.inf), limits]))
+    values, vectors = np.linalg.eigh(scaled)
+    root = vectors * np.sqrt(np.where(values > _nothing(len(values)), values, 0.0))
+    _, sizes, along = np.linalg.svd(root[count:], full_matrices=False)
+    along = along[sizes**2 > _nothing(len(values))]
+    return np.asarray((root[:count] - root[:count] @ along.T @ along) / scale[:count, None])
 
 
 def thin_root(information: Array, sd: Array) -> Array:

@@ -376,6 +376,7 @@ def _from_there(free: Calibration, observations: Observations, options: Options)
     Raises:
         SolutionError: the observations contradict a statement, or no solution from that start agrees with all of them.
     """
+    from ceres_cal.calibration.lens_seen import profiles_of, seen_through
     from ceres_cal.robust.conflicts import contradicted_by
 
     stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
@@ -383,9 +384,14 @@ def _from_there(free: Calibration, observations: Observations, options: Options)
     words = contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
     if words:
         raise SolutionError(words) from None
-    start = Start(free.estimate, free.phi_from)
-    # reads: "no calibration agrees with the stated priors, but ..."
-    found = attempt(partial(_of_lens_asked, Task(), start, gather_sights(observations), options))
+    sights = gather_sights(observations)
+
+    def from_there() -> Calibration:
+        # Lenses are chosen from a start with the paper's lens, not with those that were chosen without the statements.
+        there = seen_through(free.estimate, _named(options), profiles_of(free.estimate, sights))
+        return _of_lens_asked(Task(), Start(there, free.phi_from), sights, options)
+
+    found = attempt(from_there)  # reads: "no calibration agrees with the stated priors, but ..."
     if isinstance(found, CalibrationError):
         raise SolutionError(_OTHERWISE) from None
     return found.redrawn()

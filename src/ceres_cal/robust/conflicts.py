@@ -238,7 +238,7 @@ def contradicted_by(
     rests = [Rest(estimate, np.zeros(len(one.keys)), posterior.marginal(one.keys), freedom) for one in groups]
     tests = [worst_test(one, rest) for one, rest in zip(groups, rests, strict=True)]
     number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
-    if number < 0 or tests[number].log_p > np.log(LEVEL):
+    if number < 0 or tests[number].log_p > np.log(LEVEL / len(tests)):
         return None
     return contradicted(groups[number], tests[number], True, ()).words
 
