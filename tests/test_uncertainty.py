@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,9 +31,18 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior import uncertainty
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.bent import valley
-from ceres_cal.posterior.maps import locate_slopes, located_by, read, spread_of_points, visible_pixels
+from ceres_cal.posterior.maps import (
+    FieldMap,
+    field_map,
+    locate_slopes,
+    located_by,
+    read,
+    spread_of_points,
+    visible_pixels,
+)
 from ceres_cal.posterior.mixture import moments, quantiles, radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
@@ -555,6 +565,25 @@ def test_the_predicted_seam_is_what_draws_do() -> None:
     seam = calibration.uncertainty.seam_sd_mm("left", "right", 0.15)
     assert 0.3 < seam.mean_mm < 1.0  # 0.7 measured
     assert np.isnan(seam.sd_mm).any() and np.isfinite(seam.sd_mm).sum() > 50  # the middle of the field alone
+
+
+def test_a_seam_is_made_of_the_maps_that_were_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four cameras whose phi was followed, each of six pairs computed the maps of both again: 13 of 33 s."""
+    _, calibration = seen_twice()
+    posterior, made = calibration.uncertainty.posterior, []
+    camera = calibration.estimate.stations["left"].camera
+    own = replace(posterior, mixtures={**posterior.mixtures, camera: posterior.mixture(camera)})
+    known = replace(calibration.uncertainty, posterior=own)
+
+    def mapped(*given: Any) -> FieldMap:
+        made.append(given[2])
+        return field_map(*given)
+
+    monkeypatch.setattr(uncertainty, "field_map", mapped)
+    left, right = (known.map_sd_mm(name) for name in ("left", "right"))
+    seam = known.seam_sd_mm("left", "right")
+    assert made == ["left", "right"]
+    assert seam.sd_mm == pytest.approx(np.hypot(left.sd_mm, right.sd_mm), nan_ok=True)
 
 
 @pytest.mark.thorough

@@ -5,7 +5,7 @@ Also the relative pose of two cameras: baseline and angle, with standard deviati
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from ceres_cal.posterior.maps import (
     FieldGrid,
     FieldMap,
     Functional,
-    field_map,
     located_by,
     read,
     station_keys,
@@ -84,18 +83,27 @@ def _numbers(estimate: Estimate, first: str, second: str) -> Array:
     return np.array([np.linalg.norm(b.position - a.position), np.linalg.norm(turn)])
 
 
-def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], grid: FieldGrid) -> FieldMap:
+def seam_map(
+    estimate: Estimate,
+    posterior: Posterior,
+    pair: tuple[str, str],
+    grid: FieldGrid,
+    map_of: Callable[[str], FieldMap],
+) -> FieldMap:
     """Return the predicted disagreement of two stations about places that both see, over a grid; `station` names both.
 
     What they have in common (one field, one camera, shared boards) is taken into account, except for cameras with a
     mixture of their own, as where phi is followed: those count as independent.
+
+    Args:
+        map_of: the map of one station over the same grid.
 
     Raises:
         InputError: see `maps.station_keys`.
     """
     both = " - ".join(pair)
     if {estimate.stations[s].camera for s in pair if s in estimate.stations} & posterior.mixtures.keys():
-        a, b = (field_map(estimate, posterior, station, grid) for station in pair)
+        a, b = map(map_of, pair)
         sd_mm, radius_mm = np.hypot(a.sd_mm, b.sd_mm), np.hypot(a.radius_95_mm, b.radius_95_mm)
         return replace(a, station=both, sd_mm=sd_mm, radius_95_mm=radius_mm)
     known, visible = predicted(estimate, posterior, pair, grid.places, grid.height_m)

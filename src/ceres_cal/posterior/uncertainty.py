@@ -316,7 +316,8 @@ class Uncertainty(Frozen):
         """
         from ceres_cal.posterior.seam import seam_map
 
-        return seam_map(self.estimate, self.posterior, (first, second), self._grid(height_m, x_m, y_m))
+        map_of = partial(self.map_sd_mm, height_m=height_m, x_m=x_m, y_m=y_m)
+        return seam_map(self.estimate, self.posterior, (first, second), self._grid(height_m, x_m, y_m), map_of)
 
     def _grid(self, height_m: float, x_m: ArrayLike | None, y_m: ArrayLike | None) -> FieldGrid:
         """Return a grid; where x and y are not given, over the box around the targets that do not move.
