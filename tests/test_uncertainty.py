@@ -31,19 +31,17 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.posterior import uncertainty
+from ceres_cal.posterior import maps
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.bent import valley
 from ceres_cal.posterior.maps import (
-    FieldMap,
-    field_map,
     locate_slopes,
     located_by,
     read,
     spread_of_points,
     visible_pixels,
 )
-from ceres_cal.posterior.mixture import moments, quantiles, radii
+from ceres_cal.posterior.mixture import Reading, moments, quantiles, radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
@@ -575,14 +573,14 @@ def test_a_seam_is_made_of_the_maps_that_were_computed(monkeypatch: pytest.Monke
     own = replace(posterior, mixtures={**posterior.mixtures, camera: posterior.mixture(camera)})
     known = replace(calibration.uncertainty, posterior=own)
 
-    def mapped(*given: Any) -> FieldMap:
-        made.append(given[2])
-        return field_map(*given)
+    def counted(*given: Any) -> Reading:
+        made.append(given[3])
+        return read(*given)
 
-    monkeypatch.setattr(uncertainty, "field_map", mapped)
+    monkeypatch.setattr(maps, "read", counted)
     left, right = (known.map_sd_mm(name) for name in ("left", "right"))
     seam = known.seam_sd_mm("left", "right")
-    assert made == ["left", "right"]
+    assert made == [calibration.estimate.stations[name].camera for name in ("left", "right")]
     assert seam.sd_mm == pytest.approx(np.hypot(left.sd_mm, right.sd_mm), nan_ok=True)
 
 
