@@ -55,7 +55,7 @@ from ceres_cal.problem.quantities import PHI_RANGE, intrinsic_keys, moved, natur
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.foreign import nearest
-from ceres_cal.scene.lens import KannalaBrandt, Radial
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial
 from ceres_cal.scene.targets import Segment, checkerboard
 from ceres_cal.simulate import Disturbance, Station, simulate
 
@@ -327,6 +327,25 @@ def test_beyond_the_lines_a_height_is_known_no_better_than_the_floor() -> None:
     floor, above = (known.located(corners, height_m).radius_95_m for height_m in (0.0, 0.15))
     assert known.posterior.followed and np.all(floor > 0.1)  # 0.20 to 0.39 measured
     assert np.all(above > 0.97 * (1.0 - 0.15 / camera.position[2]) * floor)  # 0.985 to 1.01 measured
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_coefficient_is_known_as_far_as_lenses_agree_about_it(seed: int) -> None:
+    """The chosen lens lacks k2, and predicts as well as those that have it: its own k1 is 6 to 9 of its standard
+    deviations off if the lens is taken for granted.
+    """
+    camera = Camera((2448, 2048), 1900.0, (1180.0, 1029.0), Brown((-0.2287, 0.0178, -4e-4, 2e-4, 0.0)))
+    station = Station("overhead", overhead_pose(-1.47, 0.28, 4.0, 1.0, -0.8, 2.0))
+    scene = field_scene(FIELD, {"overhead": camera}, {"overhead": station}, spacing_m=0.3)
+    noise = Disturbance(points_sigma_px=1.5, curves_sigma_px=1.5)
+    height = Prior("station", "overhead", "height_m", (4.0,), (0.01,))
+    calibration = calibrate(simulate(scene, noise, seed).observations, Options(priors=(height,)))
+    known, posterior = calibration.uncertainty, calibration.uncertainty.posterior
+    k1 = known.verdict("camera", "overhead", "k1")
+    off, alone = abs(k1.value + 0.2287), posterior.spread.sd[posterior.column("camera", "overhead", "k1")]
+    assert calibration.lens_choice is not None and calibration.lens_choice.chosen == "brown k1 p1 p2"
+    assert off > 5.0 * alone  # 8.7 and 6.1 measured
+    assert off < 2.0 * k1.sd and k1.verdict == "weak"  # 1.0 and 0.8 measured
 
 
 def test_other_lenses_bend_as_the_chosen_one_does() -> None:

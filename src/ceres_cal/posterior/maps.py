@@ -360,14 +360,14 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
         camera: the only camera that it depends on; "" where it depends on several.
     """
     mixture, width = posterior.mixture(camera), posterior.half_width
-    values, covariances = _of_components(mixture, estimate, shown, posterior.lenses, width)
+    values, covariances = _of_components(mixture, estimate, shown, posterior.lenses, width, camera)
     lost = np.asarray(np.isnan(values).any(axis=(0, 2)) | np.isnan(covariances).any(axis=(0, 2, 3)))
     values[:, lost], covariances[:, lost] = 0.0, 0.0
     return Reading(*mixture.refined(values, covariances), lost, width, mixture.is_followed)
 
 
 def _of_components(
-    mixture: Mixture, estimate: Estimate, shown: Functional, lenses: Sequence[Estimate], width: float
+    mixture: Mixture, estimate: Estimate, shown: Functional, lenses: Sequence[Estimate], width: float, camera: str
 ) -> tuple[Array, Array]:
     """(C, N, 2) values of each component, relative to the estimate's, and (C, N, 2, 2) covariances.
 
@@ -381,18 +381,34 @@ def _of_components(
     as_lenses = {} if part is None else mixture.lenses
     off = [part(lens) - part(lenses[0]) for lens in lenses] if part and as_lenses else []
 
+    owners = {camera} | {name for name, one in estimate.stations.items() if one.camera == camera}
+    own = np.array([not camera or key.owner in owners for key in mixture.keys], dtype=bool)
+
     def there(component: int) -> Estimate:
         step = mixture.steps[component]
         return moved(estimate, mixture.keys, step) if np.any(step) else estimate
 
+    def once(function: Callable[[Estimate], Array]) -> Callable[[int], Array]:
+        """Components of a rig may differ by other cameras' numbers alone."""
+        found = dict[bytes, Array]()
+
+        def at(component: int) -> Array:
+            step = mixture.steps[component, own].tobytes()
+            if step not in found:
+                found[step] = function(there(component))
+            return found[step]
+
+        return at
+
+    shown_at, part_at = once(shown.values), once(part or shown.values)
     for component, number in enumerate(mixture.at.tolist()):
         like_lens = part is shown.values and component in as_lenses and np.isfinite(off[as_lenses[component][0]]).all()
         if like_lens and number in known:
             continue
         near = estimate
         with suppress(InputError):  # reads: "unknown" at these places of the map
-            near = there(component)
-            values[component] = shown.values(near) - here
+            values[component] = shown_at(component) - here
+            near = there(component) if number not in known else near
         if number not in known:
             far = width if mixture.is_followed else 0.0
             known[number] = _covariance(mixture.information[number], near, shown, far)
@@ -401,7 +417,7 @@ def _of_components(
         if part and part is not shown.values:
             as_lens = np.full_like(here, np.nan)
             with suppress(InputError):  # reads: "unknown" at these places of the map
-                as_lens = values[component] - part(there(component)) + part(there(alike))
+                as_lens = values[component] - part_at(component) + part_at(alike)
         values[component] = np.where(np.isfinite(off[lens]), as_lens + off[lens], values[component])
     return values, np.array([known[number] for number in mixture.at.tolist()])
 
