@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from scenery import field_scene, overhead_pose
+from scenery import board_scene, field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
 from thorough import partly
 
@@ -24,10 +24,12 @@ from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.parameters import Station as CameraPlaces
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 from ceres_cal.robust.usable import require_possible
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
-from ceres_cal.scene.targets import Target, custom, ssl_field
+from ceres_cal.scene.targets import Target, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 from ceres_cal.start import initialise
 
@@ -167,3 +169,19 @@ def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
     stated = Options(priors=(Prior("station", "camera", "height_m", (5.2,), (0.02,)),))  # it was searched 43 times
     text = refusal(swapped.part(np.zeros(0, bool), shown), stated)
     assert "mirrored" in text and "x and y are swapped" in text and sought.call_count == 1
+
+
+def test_one_view_under_wrong_labels_is_named_and_costs_no_trust() -> None:
+    """Nothing depends on the pose of a board that no other view shows; it is said neither to be seen from behind."""
+    cameras, stations = {"camera": camera("radial-2-3")}, {"camera": Station("camera", Pose.identity())}
+    scene = board_scene(checkerboard(9, 6, 0.1), cameras, stations, count=16, seed=11)
+    seen = simulate(scene, NOISE, 1).observations
+    mixed, own = seen.points.pixels.copy(), np.flatnonzero(seen.points.view == 3)
+    mixed[own] = mixed[np.random.default_rng(1).permutation(own)]
+    wrong = replace(seen, points=replace(seen.points, pixels=mixed))
+    before, after = calibrate(seen), calibrate(wrong)
+    assert not before.warnings and not after.warnings
+    assert "placement 'board_04': 94 % of its observations were taken out" in " ".join(after.remarks)
+    levels = [judge_quality(quality_of(one, told)).level for one, told in ((before, seen), (after, wrong))]
+    assert levels[0] == levels[1]
+    assert after.station("camera").phi == pytest.approx(before.station("camera").phi, abs=1.0)  # 0.28 px measured

@@ -6,7 +6,7 @@ Also the warnings about what observations leave open: phi that they do not deter
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -167,27 +167,33 @@ def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -
     return found
 
 
-def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:
+def seen_from_behind(estimate: Estimate, observations: Observations, lost: Collection[str | None]) -> Iterator[str]:
     """Yield warnings about opaque flat targets that some views show from the other side than most, and about cameras
     that see every printed checkerboard from behind: the mirrored picture of a plane fits as well as the true one. There
     is no warning of the second kind where a camera sees a floor, which `require_possible` found to be seen from above:
     then the pictures are right, and the rows of the boards are counted upwards.
+
+    Args:
+        lost: placements whose poses are not known.
     """
-    yield from _seen_from_both_sides(estimate, observations)
+    posed = {*estimate.placements} - {*lost}
+    yield from _seen_from_both_sides(estimate, observations, posed)
     if any(view.placement is None and not observations.targets[view.target].movable for view in observations.views):
         return
     boards = {name for name, target in observations.targets.items() if target.grid and target.grid.checkered}
-    posed = [view for view in observations.views if view.target in boards and view.placement in estimate.placements]
+    shown = [view for view in observations.views if view.target in boards and view.placement in posed]
     for name in estimate.cameras:
-        own = [view for view in posed if view.camera == name]
+        own = [view for view in shown if view.camera == name]
         if own and np.all(_heights_of_cameras(estimate, own) > 0.0):
             yield _BEHIND.format(name, len(own))
 
 
-def _seen_from_both_sides(estimate: Estimate, observations: Observations) -> Iterator[str]:
+def _seen_from_both_sides(
+    estimate: Estimate, observations: Observations, posed: Collection[str | None]
+) -> Iterator[str]:
     """Check placements that one camera alone sees; where others see them, too, a mirrored list does not fit."""
     seen = Counter(one.placement for one in observations.shown_views)
-    alone = {placement for placement in estimate.placements if seen[placement] == 1}
+    alone = {placement for placement in posed if seen[placement] == 1}
     for name, target in observations.targets.items():
         heights = target.places[:, 2]
         views = [one for one in observations.shown_views if one.target == name and one.placement in alone]

@@ -49,7 +49,7 @@ from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.stated import Conflicts, statements
 from ceres_cal.robust.unsteady import ViewDisplacement, find_unsteady
-from ceres_cal.robust.usable import misnamed, require_fits, require_possible, require_usable, shows_all
+from ceres_cal.robust.usable import lost_sights, misnamed, require_fits, require_possible, require_usable, shows_all
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
 
@@ -262,6 +262,8 @@ def known_of(seen: TaskSolution) -> Calibration:
     effects, of_targets = seen.effects, misnamed(seen.as_built, seen.problem.observations.targets)
     solved_for = (one.warning for one in effects if one.is_solved)
     warnings = (*(one.warning for one in explanations), *solved_for, *of_targets)
+    groups = [one.rows for one in seen.explanations if one.is_taken]
+    lost = [*lost_sights(seen.end.inliers, seen.problem, groups)]
     posterior, alike, alone, remarks = None, dict[str, bool](), dict[str, tuple[float, float]](), tuple[str, ...]()
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)
@@ -270,16 +272,16 @@ def known_of(seen: TaskSolution) -> Calibration:
         alone = aspects_alone(seen.end, seen.problem, posterior)
         strange = (
             *unusual_pixels(seen.end, seen.problem, alone),
-            *seen_from_behind(seen.end.estimate, seen.problem.observations),
+            *seen_from_behind(seen.end.estimate, seen.problem.observations, [one.key.placement for one in lost]),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
         remarks = tuple(remarks_of(seen.end, seen.problem, posterior))
     calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)
-    groups = [one.rows for one in seen.explanations if one.is_taken]
-    usable = require_usable(seen.end, seen.problem, groups, is_refit=task.before is not None)
-    warnings = (*calibration.warnings, *usable, *warnings)
+    usable = require_usable(seen.end, is_refit=task.before is not None)
+    warnings = (*calibration.warnings, *usable, *(one.words for one in lost if not one.is_alone), *warnings)
+    remarks = (*remarks, *(one.words for one in lost if one.is_alone))
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     apart = tuple(text for text, is_apart in alike.items() if is_apart)
     calibration = replace(calibration, remarks=(*calibration.remarks, *remarks), ambiguities=apart)

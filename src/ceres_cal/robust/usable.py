@@ -13,12 +13,13 @@ grid.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ceres_cal.base import Array, Mask, SolutionError, distinct, median
 from ceres_cal.effects import AsBuilt
-from ceres_cal.observations import Observations, Sights
+from ceres_cal.observations import Observations, SightKey, Sights
 from ceres_cal.problem import Estimate, Problem, Residuals, floor_of
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
@@ -144,14 +145,11 @@ def shows_all(end: RobustSolution) -> bool:
     return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)
 
 
-def require_usable(
-    end: RobustSolution, problem: Problem, groups: Sequence[Mask], *, is_refit: bool = False
-) -> tuple[str, ...]:
-    """Warnings about the solution. Raises SolutionError where it must not be used.
+def require_usable(end: RobustSolution, *, is_refit: bool = False) -> tuple[str, ...]:
+    """Warnings about the cameras of a solution. Raises SolutionError where it must not be used.
 
     Args:
-        groups: masks (N + M,) of the observations that were left out as one group each. is_refit: whether the lens was
-            chosen earlier.
+        is_refit: whether the lens was chosen earlier.
     """
     instead = "choose fewer or other coefficients, or observe nearer to the corners"
     if is_refit:
@@ -184,7 +182,7 @@ def require_usable(
             f"{where}: pixels from there to the corner ({corner:.0f} px) cannot be undistorted; "
             f"observations reach {observed.reach_px:.0f} px"
         )
-    return (*warnings, *_lost(end.inliers, problem, groups))
+    return tuple(warnings)
 
 
 def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
@@ -199,8 +197,25 @@ def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
     return bool(off_px > _UNUSUAL * np.hypot(*size) and other_px < _NEARER * off_px)
 
 
-def _lost(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterator[str]:
-    """Warn of sights with most observations rejected one by one: they were not explained, whatever the rest is."""
+class LostSight(NamedTuple):
+    """A sight with most observations rejected, so that its pose is not known.
+
+    Attributes:
+        words: for the user. is_alone: whether it is that of a placement that no other sight shows, so that nothing else
+            depends on it.
+    """
+
+    key: SightKey
+    words: str
+    is_alone: bool
+
+
+def lost_sights(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterator[LostSight]:
+    """Yield the sights with most observations rejected one by one.
+
+    Args:
+        groups: masks (N + M,) of the observations that were left out as one group each, which explains them.
+    """
     used = inliers.rows
     for rows in groups:
         used |= rows
@@ -214,7 +229,8 @@ def _lost(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterato
         otherwise = shown_otherwise(problem.observations)
     for key, share in lost:
         checks = otherwise.get((key.station, str(key.placement)), "check its labels, do not use its pose")
-        yield f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"
+        words = f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"
+        yield LostSight(key, words, key.placement in sights.seen_once)
 
 
 # ---- targets whose points are not those of the drawing ---------------------------------------------------------------
