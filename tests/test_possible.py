@@ -181,7 +181,27 @@ def test_one_view_under_wrong_labels_is_named_and_costs_no_trust() -> None:
     wrong = replace(seen, points=replace(seen.points, pixels=mixed))
     before, after = calibrate(seen), calibrate(wrong)
     assert not before.warnings and not after.warnings
-    assert "placement 'board_04': 94 % of its observations were taken out" in " ".join(after.remarks)
+    assert "placement 'board_04': 100 % of its observations were taken out" in " ".join(after.remarks)
     levels = [judge_quality(quality_of(one, told)).level for one, told in ((before, seen), (after, wrong))]
     assert levels[0] == levels[1]
     assert after.station("camera").phi == pytest.approx(before.station("camera").phi, abs=1.0)  # 0.28 px measured
+
+
+@pytest.mark.parametrize("seed", partly((100, 103, 107, 108, 109, 110, 111, 112, 116), (107, 109)))
+def test_views_under_wrong_labels_decide_no_lens(seed: int) -> None:
+    """Three corners of 54 agree with the pose of such a board by chance: with them, a lens that was too short was
+    chosen in two of 20 sets, and phi was 3.5 and 4.2 standard deviations off.
+    """
+    cameras, stations = {"camera": camera("radial-2-3")}, {"camera": Station("camera", Pose.identity())}
+    scene = board_scene(checkerboard(9, 6, 0.1), cameras, stations, count=16, seed=seed)
+    seen, rng = simulate(scene, NOISE, seed).observations, np.random.default_rng(seed)
+    bad, mixed = rng.choice(16, [2, 3, 4][seed % 3], replace=False), seen.points.pixels.copy()
+    for own in (np.flatnonzero(seen.points.view == view) for view in bad):
+        mixed[own] = mixed[rng.permutation(own)]
+    wrong = replace(seen, points=replace(seen.points, pixels=mixed))
+    known = calibrate(wrong)
+    inliers = known.inlier_masks(wrong)[0]
+    assert not np.any(inliers[np.isin(seen.points.view, bad)])
+    assert np.mean(inliers[~np.isin(seen.points.view, bad)]) > 0.99
+    phi = known.uncertainty.verdict("camera", "camera", "phi")
+    assert abs(phi.value - cameras["camera"].phi) < 2.5 * phi.sd  # 1.6 measured

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, Pose, median, or_none, replace
+from ceres_cal.base import Array, Indices, Mask, Pose, median, or_none, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem import Estimate, Information, Problem, Solution, Weighting, placement_costs, solve
 from ceres_cal.problem.quantities import difference, natural_sizes
@@ -152,6 +152,15 @@ def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimat
             estimate = there
             count += 1
     return estimate, count
+
+
+def lost_rows(problem: Problem, inliers: Inliers) -> Mask:
+    """(N + M,) the observations of lost placements. The few that agree with such a pose do so by chance."""
+    sights, rows = problem.sights, np.zeros_like(inliers.rows)
+    lost = np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST)
+    own = sights.take(np.array([i for i in lost if sights.keys[i].placement in problem.layout.placements], np.int64))
+    rows[own.point_rows] = rows[len(inliers.points) + own.curve_rows] = True
+    return rows
 
 
 def _suits_all(sights: Sights, there: Estimate, before: Estimate, weighting: Weighting) -> bool:
