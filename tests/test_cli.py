@@ -345,10 +345,10 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
     for words in (
         "20 views, 1 camera, 1 station, 12 placements",
         "680 point observations, 1591 curve observations",
-        f"phi {camera.phi:.1f} px 2.3 px",
+        f"phi {camera.phi:.1f} px 2.8 px",
         "phi: started from the views",
         f"a2, px⁻¹ {camera.lens.values[0]:.1e} 2.2e-05 -5.4e-05 to 2.2e-05 weak",
-        f"height {camera.position[2]:.4f} m 7.9 mm",
+        f"height {camera.position[2]:.4f} m 7.3 mm",
         "located overhead: ± 0.36 mm on the floor (worst 1 at 0.8, 3.0 m), ± 0.43 mm at 150 mm",
         "tilt from straight down",
         "of 2271 taken out",
@@ -511,7 +511,8 @@ def test_warns_where_phi_is_unknown(say: Say, tmp_path: Path) -> None:
     assert "too frontal to determine phi (95 %: below " in " ".join(said.out.split())
     held = say("calibrate", tmp_path / "frontal.json", "--prior", "height_m=4:0.01")
     assert "warning" not in held.out and "unknown" not in held.out
-    assert all(line.split()[0] in ("a2,", "a3,") for line in held.out.splitlines() if line.endswith("weak"))
+    # phi to 1.1 %: a lens of another kind, nearly as good, has it 4 % longer
+    assert all(line.split()[0] in ("phi", "a2,", "a3,") for line in held.out.splitlines() if line.endswith("weak"))
 
 
 def test_unknown_is_null_for_scripts(say: Say, tmp_path: Path) -> None:

@@ -19,8 +19,9 @@ from accuracy.bound import bound, make_trial
 from accuracy.intervals import CASES, cover, share
 from accuracy.odd_scenes import LENSES as ODD_LENSES
 from accuracy.scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
-from scenery import field_scene, overhead_pose
+from scenery import board_scene, field_scene, overhead_pose
 from scenes import RADIAL, SCENES
+from scenes import camera as camera_of
 from thorough import partly
 
 from ceres_cal.base.arrays import Array
@@ -346,6 +347,23 @@ def test_a_coefficient_is_known_as_far_as_lenses_agree_about_it(seed: int) -> No
     assert calibration.lens_choice is not None and calibration.lens_choice.chosen == "brown k1 p1 p2"
     assert off > 5.0 * alone  # 8.7 and 6.1 measured
     assert off < 2.0 * k1.sd and k1.verdict == "weak"  # 1.0 and 0.8 measured
+
+
+@pytest.mark.parametrize(("lens", "seed"), [("brown", 114), ("radial-2-3", 114), ("radial-2-3", 115)])
+def test_phi_is_known_as_far_as_lenses_of_all_kinds_agree_about_it(lens: str, seed: int) -> None:
+    """Sixteen boards and a lens of another kind that predicts as well: phi, the focal length on the axis with every
+    kind, is 3.4, 4.6 and 0.8 standard deviations off if only lenses of the chosen kind count.
+    """
+    station, true = Station("camera", Pose.identity()), camera_of(lens)
+    scene = board_scene(checkerboard(9, 6, 0.1), {"camera": true}, {"camera": station}, count=16, seed=seed)
+    seen = simulate(scene, Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3), seed).observations
+    known = calibrate(seen).uncertainty
+    phi, posterior = known.verdict("camera", "camera", "phi"), known.posterior
+    column = posterior.column("camera", "camera", "phi")
+    kinds = {other.cameras["camera"].lens.kind for other in posterior.lenses}
+    assert len(kinds) > 1
+    assert phi.sd > 1.15 * float(posterior.mixture().sd[column])  # 1.23, 1.23 and 1.75 measured
+    assert abs(phi.value - true.phi) < 4.0 * phi.sd  # 2.8, 3.7 and 0.5 measured
 
 
 def test_other_lenses_bend_as_the_chosen_one_does() -> None:

@@ -253,10 +253,10 @@ class Posterior(Frozen):
 
     @cached_property
     def _numbers(self) -> tuple[Mixture, ...]:
-        """The mixtures for reading single numbers: a component with another lens of the same kind has that lens's own
-        phi, height and coefficients. With the numbers by which the chosen lens shows the same, phi was known to 0.2 %,
-        20 standard deviations off, where a coefficient that the chosen lens lacks leaves it open to 5 %; and k1 to
-        0.7 %, 11 standard deviations off.
+        """The mixtures for reading single numbers: a component with another lens has that lens's own phi and poses, and
+        coefficients if it is of the same kind. With the numbers by which the chosen lens shows the same, phi was known
+        to 0.2 %, 20 standard deviations off, where a coefficient that the chosen lens lacks leaves it open to 5 %; and
+        k1 to 0.7 %, 11 standard deviations off.
         """
         found = []
         for mixture in self._read:
@@ -268,16 +268,18 @@ class Posterior(Frozen):
         return tuple(found)
 
     def _off(self, lens: int, keys: Sequence[Key]) -> Array:
-        """(K,) phi, coefficients and stations' poses with a lens, relative to the chosen one; NaN for all else: for
-        another kind of lens, or one that lacks the coefficient; for numbers that are followed; and beside boards that
-        several cameras see, because each lens was solved for without the other cameras.
+        """(K,) phi, stations' poses and coefficients with a lens, relative to the chosen one; NaN for all else: for
+        coefficients that this lens lacks, or of another kind; for numbers that are followed; and beside boards that
+        several cameras see, because each lens was solved for without the other cameras. Phi is the focal length on the
+        axis with every kind of lens.
         """
         chosen, other, off = self.lenses[0], self.lenses[lens], np.full(len(keys), np.nan)
         if any(key.kind == "placement" for key in self.keys):
             return off
         alike = {name for name, one in other.cameras.items() if one.lens.kind == chosen.cameras[name].lens.kind}
-        owners = {("station", name) for name, station in other.stations.items() if station.camera in alike}
-        own = {("camera", name, q) for name in alike for q in ("phi", *other.cameras[name].lens.names)}
+        owners = {("station", name) for name in other.stations}
+        own = {("camera", name, "phi") for name in other.cameras}
+        own |= {("camera", name, coefficient) for name in alike for coefficient in other.cameras[name].lens.names}
         own -= {key[:3] for key in self.followed_phi}
         at = [i for i, key in enumerate(keys) if key[:2] in owners or key[:3] in own]
         off[at] = difference(other, chosen, [keys[i] for i in at])
