@@ -20,13 +20,15 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem import problem_of
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.parameters import Station as CameraPlaces
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
-from ceres_cal.robust.usable import require_possible
+from ceres_cal.robust.robust import solve_robustly
+from ceres_cal.robust.usable import require_possible, require_usable
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import Target, checkerboard, custom, ssl_field
@@ -205,3 +207,15 @@ def test_views_under_wrong_labels_decide_no_lens(seed: int) -> None:
     assert np.mean(inliers[~np.isin(seen.points.view, bad)]) > 0.99
     phi = known.uncertainty.verdict("camera", "camera", "phi")
     assert abs(phi.value - cameras["camera"].phi) < 2.5 * phi.sd  # 1.6 measured
+
+
+def test_observations_that_took_part_are_shown() -> None:
+    """A minimum of misnamed lines beyond their horizon was saved with an rms of NaN, in a file that did not load."""
+    sights = gather_sights(simulate(over_a_small_field(), NOISE, 1).observations)
+    start = initialise.initialise(sights, RADIAL).estimate
+    end = solve_robustly(problem_of(sights, RADIAL, start), start)
+    require_usable(end)
+    lost = end.residuals.points.copy()
+    lost[np.flatnonzero(end.inliers.points)[:2]] = np.nan
+    with pytest.raises(SolutionError, match=r"cannot show 2 of the \d+ observations that it is based on"):
+        require_usable(replace(end, residuals=replace(end.residuals, points=lost)))

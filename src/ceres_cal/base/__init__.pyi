@@ -17,6 +17,7 @@ from ceres_cal.base.arrays import Spread as Spread
 from ceres_cal.base.arrays import are_known as are_known
 from ceres_cal.base.arrays import distinct as distinct
 from ceres_cal.base.arrays import dots as dots
+from ceres_cal.base.arrays import eigh as eigh
 from ceres_cal.base.arrays import evenly as evenly
 from ceres_cal.base.arrays import grid_places as grid_places
 from ceres_cal.base.arrays import inverse_of as inverse_of

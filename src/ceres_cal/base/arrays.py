@@ -109,6 +109,21 @@ def is_diagonal(matrix: Array) -> bool:
     return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
 
 
+def eigh(matrix: Array) -> tuple[Array, Array]:
+    """Return eigenvalues (..., n), in rising order, and vectors (..., n, n) of symmetric matrices (..., n, n).
+
+    LAPACK's `dsyevd` may not converge where eigenvalues repeat, as with many frames from one pose (numpy issues 6002
+    and 12738); then singular values of the matrix give them, moved such that none is negative.
+    """
+    try:
+        values, vectors = np.linalg.eigh(matrix)
+    except np.linalg.LinAlgError:
+        most = float(np.max(np.linalg.norm(matrix, axis=(-2, -1))))
+        turned, sizes, _ = np.linalg.svd(matrix + most * np.eye(matrix.shape[-1]))
+        return np.asarray(sizes[..., ::-1] - most), np.asarray(turned[..., ::-1])
+    return np.asarray(values), np.asarray(vectors)
+
+
 def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable] | None = None) -> Indices:
     """Index of each name among the known names; without these, among the names in order of first appearance."""
     every = list(names)
@@ -174,7 +189,7 @@ def known_inverses(information: Array, limits: Array) -> Array:
     inverse = _regular_inverses(scaled)
     if inverse is not None:
         return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
-    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = eigh(scaled)
     known = values > _nothing(values.shape[-1])
     kept = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
     half = vectors * np.sqrt(kept)[..., None, :] * scale[..., :, None]
@@ -230,7 +245,7 @@ def ridged_root_of(matrix: Array, ridge: float) -> Array:
     lower = _unless_singular(inverse_root_of, matrix + ridge * np.eye(len(matrix)))
     if lower is not None:
         return lower
-    values, vectors = np.linalg.eigh(matrix)
+    values, vectors = eigh(matrix)
     return np.asarray((vectors / np.sqrt(np.maximum(values, 0.0) + ridge)).T)
 
 
@@ -239,7 +254,7 @@ def root_of(matrix: Array) -> Array:
     lower = _unless_singular(np.linalg.cholesky, matrix)
     if lower is not None:  # takes a tenth of the time
         return lower.T
-    values, vectors = np.linalg.eigh(matrix)
+    values, vectors = eigh(matrix)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
 
@@ -268,7 +283,7 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
     else:
         left = own - coupling.T @ (inverse * size[:, None] * size) @ coupling
         scale = np.sqrt(np.diagonal(own))
-        values, vectors = np.linalg.eigh(0.5 * (left + left.T) / scale[:, None] / scale)
+        values, vectors = eigh(0.5 * (left + left.T) / scale[:, None] / scale)
         root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) * scale[:, None]  # the rest is rounding
     whole = np.zeros_like(here)
     whole[np.ix_(told, told)] = root @ root.T
@@ -284,7 +299,7 @@ def _root_without(here: Array, coupling: Array, others: Array, limits: Array) ->
     count = len(here)
     whole = np.block([[here, coupling.T], [coupling, others]])
     scale, scaled = _scaled(whole, np.concatenate([np.full(count, np.inf), limits]))
-    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = eigh(scaled)
     root = vectors * np.sqrt(np.where(values > _nothing(len(values)), values, 0.0))
     _, sizes, along = np.linalg.svd(root[count:], full_matrices=False)
     along = along[sizes**2 > _nothing(len(values))]
@@ -331,7 +346,7 @@ class Spread(Struct, frozen=True, eq=False):
         inverse = _regular_inverses(np.tril(scaled) + np.tril(scaled, -1).T)
         if inverse is not None:
             return cls(inverse * scale[:, None] * scale, np.empty((len(scale), 0)), scale)
-        values, vectors = np.linalg.eigh(scaled)
+        values, vectors = eigh(scaled)
         lost = values <= _nothing(len(values))
         half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
         return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)

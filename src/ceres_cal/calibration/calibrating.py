@@ -12,6 +12,7 @@ import numpy as np
 from ceres_cal.base import at_most, checked, counted, for_small_matrices, meanwhile, numerical, replace
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, SolutionError, attempt, or_none
 from ceres_cal.calibration import Calibration, LensChoice
+from ceres_cal.calibration.misnamed import started
 from ceres_cal.calibration.outcome import of_closed_form
 from ceres_cal.calibration.solving import Task, TaskSolution, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
@@ -240,13 +241,13 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
     sights, free = gather_sights(observations), freed(observations, options)
 
     def as_asked() -> Calibration:
-        return _of_lens_asked(task, initialise(sights, _named(options)), sights, options)
+        return _of_lens_asked(task, started(sights, _named(options)), sights, options)
 
     little, loose = loosely(observations, free)
     if not options.closed_form_only and (little, loose) != (observations, options):
         asked = replace(task, stated=(observations, options))
         # quiet: without the statements the observations are too few, here and after the start
-        start = attempt(partial(initialise, sights, _named(free)))
+        start = attempt(partial(started, sights, _named(free)))
         if isinstance(start, Start):
             little_said = replace(sights, observations=little)
             found = attempt(partial(_of_lens_asked, asked, start, little_said, loose))  # quiet: as for the start

@@ -14,7 +14,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Indices32, Mask, distinct, median, numbers_of, replace, two_digits
+from ceres_cal.base import (
+    Array,
+    Frozen,
+    Indices,
+    Indices32,
+    Mask,
+    distinct,
+    eigh,
+    median,
+    numbers_of,
+    replace,
+    two_digits,
+)
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.evidence import (
     FEATURE_ASIDE,
@@ -147,7 +159,7 @@ def _feature_modes(equations: Equations, rows: Indices) -> Array:
     away = equations.pixel[rows] - np.mean(equations.pixel[rows], axis=0)
     axes = 2 if equations.sights.is_arc[equations.feature[rows[0]]] else 1
     modes[:, 0] = 1.0
-    modes[:, 1 : 1 + axes] = away @ np.linalg.eigh(away.T @ away)[1][:, ::-1][:, :axes]
+    modes[:, 1 : 1 + axes] = away @ eigh(away.T @ away)[1][:, ::-1][:, :axes]
     return modes
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, numbers_of, replace, two_digits
+from ceres_cal.base import Array, Frozen, Indices, Mask, eigh, evenly, numbers_of, replace, two_digits
 from ceres_cal.base.tails import bisected, mixture_95, student_95
 from ceres_cal.effects.columns import SparseColumns, places_in_view, smooth_image, smooth_view
 from ceres_cal.effects.evidence import DEPENDENCE, LENS_LEAVES, LIKELY, READ_OUT, SMOOTH_ERRORS, RepeatedAmounts
@@ -262,7 +262,7 @@ class Scatter(Frozen):
         """
         along = self.root.T @ seen.matrix
         own = along @ self.root
-        values, vectors = np.linalg.eigh(0.5 * (own + own.T))
+        values, vectors = eigh(0.5 * (own + own.T))
         determined = values > _DETERMINED * values[-1]
         white = vectors[:, determined] / np.sqrt(values[determined])
         scores = np.eye(white.shape[1]) + white.T @ (self.matrix - np.eye(len(own))) @ white
@@ -270,7 +270,7 @@ class Scatter(Frozen):
         # is known a hundred times better because of that. In a rig whose cameras contradicted one another it was 1e-8,
         # and its rounding hid everything else.
         least = 1e-4
-        scatters, turned = np.linalg.eigh(0.5 * (scores + scores.T))
+        scatters, turned = eigh(0.5 * (scores + scores.T))
         inverse = (turned / np.maximum(scatters, least)) @ turned.T
         change = (along.T @ white) @ (inverse - np.eye(len(scores))) @ (white.T @ along)
         return Information(seen.keys, seen.matrix + 0.5 * (change + change.T))
@@ -424,11 +424,11 @@ def _stated_together(model: Linearised, group: Indices, scales: tuple[float, flo
 def _whole(groups: GroupNormals, scores: Array) -> Array:
     """(P, P) covariance of the score of everything, if the views left out of the sample scatter like those in it."""
     seen, everything = groups.normal.sum(axis=0), np.eye(len(groups.known)) - groups.known
-    values, vectors = np.linalg.eigh(seen)
+    values, vectors = eigh(seen)
     determined = values > 1e-6
     back = vectors[:, determined] / np.sqrt(values[determined])
     change = back.T @ scores.sum(axis=0) @ back - np.eye(int(determined.sum()))
-    values, vectors_of = np.linalg.eigh(everything)
+    values, vectors_of = eigh(everything)
     root = (vectors_of * np.sqrt(np.maximum(values, 0.0))) @ vectors_of.T @ vectors[:, determined]
     whole = np.eye(len(seen)) + root @ change @ root.T
     return np.asarray(0.5 * (whole + whole.T))

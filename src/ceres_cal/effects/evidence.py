@@ -29,7 +29,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, inverse_of, median, replace, ridged_root_of
+from ceres_cal.base import Array, Frozen, Indices, eigh, inverse_of, median, replace, ridged_root_of
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
@@ -151,7 +151,7 @@ class RandomEffects(Frozen):
         """Make it from V (Q, Q) and u (Q,), without directions with S up to `least`, or up to `share` of the
         largest.
         """
-        size, turn = np.linalg.eigh(normal)
+        size, turn = eigh(normal)
         kept = size > max(least, share * float(size[-1]))
         size, turn = size[kept], turn[:, kept]
         return cls(size, (turn.T @ slope) / np.sqrt(size), turn, rest, freedom)
@@ -241,7 +241,7 @@ def shifts_by(taken: Array, moment: Array) -> Array:
     Args:
         taken: (K, Q) by how much the free numbers move with each amount. moment: (Q, Q) mean square of the amounts.
     """
-    values, vectors = np.linalg.eigh(moment)
+    values, vectors = eigh(moment)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(np.linalg.qr((taken @ half).T, mode="r"))
 

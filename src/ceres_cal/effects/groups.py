@@ -23,7 +23,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, cached_property, known_inverses
+from ceres_cal.base import Array, Frozen, Indices, cached_property, eigh, known_inverses
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, inverse_roots, prior_equations
 from ceres_cal.observations.sights import Owner, SightKey, Sights
@@ -89,7 +89,7 @@ class GroupNormals(Frozen):
         """
         axes = np.linalg.qr(self._root[numbers].T)[0]
         gradient = (self.gradient + self.normal @ self._least_step) @ self._root
-        rest, turn = np.linalg.eigh(self._split(self._root)[1])
+        rest, turn = eigh(self._split(self._root)[1])
         along = (gradient[:, None, :] @ turn) / np.sqrt(rest)[:, None, :]
         moved = (along @ np.swapaxes(turn, 1, 2))[:, 0] @ axes
         return float(len(moved) * np.mean(moved**2))
@@ -242,7 +242,7 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
         scatter: (G, P, P) covariance of each group's score due to errors within it.
         whole: (P, P) that of all groups and of the priors.
     """
-    values, vectors = np.linalg.eigh(whole)
+    values, vectors = eigh(whole)
     values = np.maximum(values, 1e-12 * values[-1])
     white, root = (vectors * values**-0.5) @ vectors.T, (vectors * values**0.5) @ vectors.T
     seen = _seen_by(groups)  # placements of a rig count only in the sampled views
@@ -268,7 +268,7 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
 def _seen_by(groups: GroupNormals) -> Array:
     """(P, R) an orthonormal basis of the directions that any of the groups determines."""
     rounding = 1e-13  # share of the largest eigenvalue
-    values, vectors = np.linalg.eigh(groups.normal.sum(axis=0))
+    values, vectors = eigh(groups.normal.sum(axis=0))
     return np.asarray(vectors[:, values > rounding * values[-1]])
 
 
@@ -313,6 +313,6 @@ def _jackknife(normal: Array, gradient: Array, expected: Array, white: Array) ->
 
 def _widened(factor: Array, observed: Array) -> Array:
     """The unit matrix with the factor applied to the part that observations determine; priors are not affected."""
-    values, vectors = np.linalg.eigh(observed)
+    values, vectors = eigh(observed)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return np.asarray(np.eye(len(factor)) + root @ (factor - np.eye(len(factor))) @ root)

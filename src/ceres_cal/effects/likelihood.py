@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, parts_of, run_parts
+from ceres_cal.base import Array, Frozen, Indices, Mask, eigh, parts_of, run_parts
 from ceres_cal.effects.strands import ASIDE, StrandFamily, decay
 from ceres_cal.kernels import strands_left
 from ceres_cal.observations import joined
@@ -80,7 +80,7 @@ def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: fl
     shares = _SHARES if place[2] else np.zeros(1)
     fewest_freedom = 3.0  # least degrees of freedom of a variance
     size, count, many = family.columns.shape[2] - 7, int(np.count_nonzero(family.filled)), len(shares)
-    values, vectors = np.linalg.eigh(decay(family.distance, place[2] or 1.0, place[1]))
+    values, vectors = eigh(decay(family.distance, place[2] or 1.0, place[1]))
     values, rows = np.maximum(values, 0.0), np.swapaxes(family.applied(np.swapaxes(vectors, 1, 2)), 0, 1)
     logs, weights = np.zeros(many), 1.0 / (1.0 - shares[:, None, None] * (1.0 - values))
     left = _left(family, rows[..., 6:], weights)

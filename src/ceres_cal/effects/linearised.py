@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, inverse_root_of, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, eigh, inverse_root_of, replace
 from ceres_cal.observations.sights import STRUCTURE, ranges
 from ceres_cal.problem import Information, Key, Problem, Weighting, columns_by_owner, robust_weights
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
@@ -282,7 +282,7 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
 def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, Indices]:
     """`inverse_root` of a stack (..., Q, Q): roots (..., Q, Q), with columns of 0 first where left out, and ranks."""
     scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
-    values, vectors = np.linalg.eigh(scale[..., :, None] * normals * scale[..., None, :])
+    values, vectors = eigh(scale[..., :, None] * normals * scale[..., None, :])
     kept = values > least
     roots = scale[..., :, None] * vectors / np.sqrt(np.where(kept, values, np.inf))[..., None, :]
     return np.asarray(roots), np.asarray(np.count_nonzero(kept, axis=-1))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import NOTHING, Array, is_diagonal, replace
+from ceres_cal.base import NOTHING, Array, eigh, is_diagonal, replace
 from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem import Estimate, Information, Key, Problem, ReducedInformation, values_of
 from ceres_cal.scene.lens.base import Roughness
@@ -60,7 +60,7 @@ def _by_sizes(
     turned = np.flatnonzero(np.diagonal(forms[largest]) if sizes[largest] else np.zeros(len(slope)))
     rest = np.delete(np.arange(len(slope)), turned)
     unit = 1.0 / np.sqrt(np.diagonal(forms[largest])[turned])
-    values, vectors = np.linalg.eigh(normal[np.ix_(turned, turned)] * unit[:, None] * unit)
+    values, vectors = eigh(normal[np.ix_(turned, turned)] * unit[:, None] * unit)
     turn = vectors * unit[:, None]
     own, coupling, here = turn.T @ slope[turned], normal[np.ix_(rest, turned)] @ turn, normal[np.ix_(rest, rest)]
     others = np.array([form[np.ix_(rest, rest)] for form in forms])

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import NORMAL_95, Array, Frozen, SolutionError, or_none, replace
+from ceres_cal.base import NORMAL_95, Array, Frozen, SolutionError, eigh, or_none, replace
 from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Problem, Solution, over, solve, unit_px
@@ -242,7 +242,7 @@ def _drawn(count: int) -> Array:
     each = np.interp((np.arange(half) + 0.5) / half, 2.0 * normal_cdf(grid) - 1.0, grid)
     rng = np.random.default_rng(0)
     drawn = np.column_stack([rng.permutation(each) * rng.choice((-1.0, 1.0), half) for _ in range(count)])
-    values, vectors = np.linalg.eigh(drawn.T @ drawn / half)
+    values, vectors = eigh(drawn.T @ drawn / half)
     drawn = drawn @ (vectors / np.sqrt(values)) @ vectors.T
     return np.asarray(np.concatenate([drawn, -drawn]))
 
@@ -258,7 +258,7 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
     sums = {(name, q) for name, one in estimate.cameras.items() for form in one.lens.roughness for q in form.names}
     plain = np.array([key.kind in ("camera", "station") and key[1:3] not in sums for key in keys], dtype=bool)
     scaled = information.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
-    values, vectors = np.linalg.eigh(np.where(plain[:, None] & plain, scaled, 0.0))
+    values, vectors = eigh(np.where(plain[:, None] & plain, scaled, 0.0))
     weak = values > BENDING**2
     return np.asarray(vectors[:, weak] * np.sqrt(values[weak]) * sizes[:, None])
 

@@ -13,7 +13,19 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base import Array, Frozen, InputError, Shown, are_known, cached_property, html_of, median, rows, text_of
+from ceres_cal.base import (
+    Array,
+    Frozen,
+    InputError,
+    Shown,
+    are_known,
+    cached_property,
+    eigh,
+    html_of,
+    median,
+    rows,
+    text_of,
+)
 from ceres_cal.base.words import two_digits, with_sd
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
 from ceres_cal.posterior.mixture import FARTHER
@@ -182,7 +194,7 @@ class Uncertainty(Frozen):
         sizes = natural_sizes(self.estimate, keys)
         lost = posterior.spread.unknown[at] / sizes[:, None]
         finite = posterior.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
-        values, vectors = np.linalg.eigh(finite)
+        values, vectors = eigh(finite)
         weak = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
         weak += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
         every = [self._direction(keys, relative, vector) for relative, vector in weak]

@@ -208,8 +208,10 @@ def solve(
         blocks[owner][:] = chart.numbers(blocks[owner])
     try:
         solved = _unpacked(blocks, estimate, layout)
-    except InputError as error:  # phi or aspect below 0
-        raise SolutionError(f"the solve gave no camera ({error}): check labels and target dimensions") from None
+    except InputError:  # phi or aspect below 0
+        raise SolutionError(
+            "the least cost is at a negative phi or fy / fx, which no camera has: check labels and target dimensions"
+        ) from None
     for cost in costs:
         if isinstance(cost, EliminatedCost):
             solved = solved.with_placements(*cost.converged([blocks[owner] for owner in cost.owners]))

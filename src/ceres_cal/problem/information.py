@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, known_inverses, root_of, without
+from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, eigh, known_inverses, root_of, without
 from ceres_cal.observations.sights import STRUCTURE, Owner
 
 _TURNS = ("turn_x", "turn_y", "turn_z")
@@ -176,7 +176,7 @@ class Information(Frozen):
         """The least ratio of a covariance (K, K) to the one of this information, or `least` if given; and shifts (S, K)
         whose outer products sum to what it is beyond that ratio. Unknown directions count as wide enough.
         """
-        ratios, turned = np.linalg.eigh(self.root @ covariance @ self.root.T)
+        ratios, turned = eigh(self.root @ covariance @ self.root.T)
         factor = least if least is not None else float(max(np.min(ratios, initial=1.0), np.finfo(float).eps))
         more = turned * np.sqrt(np.maximum(ratios - factor, 0.0))
         return factor, (self.spread.covariance @ self.root.T @ more).T
@@ -189,7 +189,7 @@ class Information(Frozen):
         """
         moved = shifts @ self.less(stated).matrix @ self.inverse
         left = moved @ stated.matrix @ shifts.T
-        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
+        values, vectors = eigh(np.eye(len(left)) + 0.5 * (left + left.T))
         return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved)
 
     def less(self, other: Information) -> Information:
@@ -235,6 +235,6 @@ class Information(Frozen):
         if np.count_nonzero(self.matrix) == np.count_nonzero(diagonal):
             return np.asarray(np.diag(np.sqrt(diagonal))[diagonal > 0.0])
         scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
-        values, vectors = np.linalg.eigh(self.matrix * scale[:, None] * scale)
+        values, vectors = eigh(self.matrix * scale[:, None] * scale)
         kept = values > determined
         return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T / scale)

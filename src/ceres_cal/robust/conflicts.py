@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, Frozen, attempt, log_f_tail, numerical, or_none, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, attempt, eigh, log_f_tail, numerical, or_none, replace
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.problem import (
@@ -99,7 +99,7 @@ def linear_rest(statement: Statement, end: RobustSolution, near: RobustSolution 
 def _beside(covariance: Array, stated: Array, slope: Array) -> tuple[Array, Array]:
     """M = C^-1 - P and the step M^-1 z; both are 0 in directions where M is lost in rounding beside P."""
     root, back = _roots(stated, _LEAST_TOLD)
-    share, turned = np.linalg.eigh(root.T @ covariance @ root)
+    share, turned = eigh(root.T @ covariance @ root)
     share = np.clip(share, 1e-300, None)
     told = share < 1.0 - _LEAST_TOLD
     root, back, rest = root @ turned[:, told], back @ turned[:, told], 1.0 / share[told] - 1.0
@@ -109,7 +109,7 @@ def _beside(covariance: Array, stated: Array, slope: Array) -> tuple[Array, Arra
 def _roots(stated: Array, least: float) -> tuple[Array, Array]:
     """(n, k) R and B with R R^T = P and B^T R = 1, over directions stated by more than `least` at unit diagonal."""
     size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))[:, None]
-    values, vectors = np.linalg.eigh(stated / size / size.T)
+    values, vectors = eigh(stated / size / size.T)
     kept = values > least
     vectors, root = vectors[:, kept], np.sqrt(values[kept])
     return size * vectors * root, vectors / root / size
@@ -173,7 +173,7 @@ def _squared(off: Array, stated: Array, rest: Array) -> float:
     """
     least = 1e-14  # eigenvalue at unit diagonal above which a direction counts as stated
     root, back = _roots(stated, least)
-    told, turn = np.linalg.eigh(back.T @ rest @ back)  # in units in which each direction is stated with information 1
+    told, turn = eigh(back.T @ rest @ back)  # in units in which each direction is stated with information 1
     along = off @ root @ turn
     return float(np.sum(np.where(told > _LEAST_TOLD, told / (1.0 + told), 0.0) * along**2))
 

@@ -25,7 +25,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Mask, first_of, inverse_of, replace, two_digits
+from ceres_cal.base import Array, Frozen, Mask, eigh, first_of, inverse_of, replace, two_digits
 from ceres_cal.effects import (
     Linearised,
     SparseColumns,
@@ -245,7 +245,7 @@ def _seem_displaced(equations: Equations, weights: Weights) -> bool:
     columns *= (weights.inverse_sigma * weights.used)[:, None]
     left = posed(np.array([columns[start:stop].T @ columns[start:stop] for start, stop in pairwise(equations.bounds)]))
     whole_told, scores, squares = left[:, :-1, :-1], left[:, :-1, -1], left[:, -1, -1]
-    values, axes = np.linalg.eigh(whole_told[:, 2:, 2:])
+    values, axes = eigh(whole_told[:, 2:, 2:])
     along = (scores[:, None, 2:] @ axes)[:, 0]
     known = values > _TOLD * values[:, -1:]
     taken = np.sum(along[known] ** 2 / values[known])

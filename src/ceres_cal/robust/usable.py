@@ -32,19 +32,20 @@ from ceres_cal.scene.targets import Target
 _NEARER = 0.5
 _BELOW = 0.5  # share of the camera's height over the floor: noise lowers a board only by centimetres
 
-# Share of the image's diagonal: 24 px of 1600. If half of a camera's observations are farther off than this, the result
-# is no calibration; a lens that is too simple leaves at most a few pixels. Halving or doubling changes nothing.
-_NO_FIT = 0.015
+NO_FIT = 0.015
+"""Share of the image's diagonal: 24 px of 1600. If half of a camera's observations are farther off, the result is no
+calibration; a lens that is too simple leaves at most a few pixels. Halving or doubling changes nothing.
+"""
 
 
 def require_fits(end: RobustSolution, problem: Problem) -> None:
     """Raise SolutionError where the solve failed, or where the solution misses too many observations."""
     if end.solution.failed:
-        raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
+        raise SolutionError("the solve found no camera from its start: check labels and target dimensions")
     points, curves = end.residuals.lengths
     for name, camera in end.estimate.cameras.items():
         own = problem.sights.of_camera(name)
-        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
+        limit_px = NO_FIT * float(np.hypot(*camera.image_size))
         met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
         met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
         if 2 * met < len(own.point_rows) + len(own.curve_rows):
@@ -155,6 +156,7 @@ def require_usable(end: RobustSolution, *, is_refit: bool = False) -> tuple[str,
     if is_refit:
         instead = "keep the lens as it was (--what pose-only), or calibrate again with fewer coefficients"
     warnings = []
+    _require_shown(end)
     for name, camera in end.estimate.cameras.items():
         width, height = camera.image_size
         off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
@@ -183,6 +185,19 @@ def require_usable(end: RobustSolution, *, is_refit: bool = False) -> tuple[str,
             f"observations reach {observed.reach_px:.0f} px"
         )
     return tuple(warnings)
+
+
+def _require_shown(end: RobustSolution) -> None:
+    """Raise SolutionError where the solution does not show observations that took part: their residuals do not exist.
+    A later minimum may lie on the far side of the horizon, where a line is still followed from one step to the next.
+    """
+    lengths = np.concatenate(end.residuals.lengths)
+    lost = np.count_nonzero(end.inliers.rows & ~np.isfinite(lengths))
+    if lost:
+        raise SolutionError(
+            f"the best solution cannot show {lost} of the {np.count_nonzero(end.inliers.rows)} observations that it is "
+            "based on: check labels and target dimensions"
+        )
 
 
 def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:

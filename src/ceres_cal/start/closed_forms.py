@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal import kernels
-from ceres_cal.base import Array, DegenerateError, Frozen, Indices, Pose, dots, median, parts_of, run_parts
+from ceres_cal.base import Array, DegenerateError, Frozen, Indices, Pose, dots, eigh, median, parts_of, run_parts
 from ceres_cal.scene import Camera, Lens
 
 # Length of a wrong residual in median errors: no clean residual is that long, nine standard deviations. Halving it
@@ -243,7 +243,7 @@ def _fitted_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array
     # The middle of the distances that G's eight numbers cannot fit exactly: the median of all may be 0.
     middle = min((len(lines) + of_a_plane) // 2, len(lines) - 1)
     for _ in range(rounds):
-        values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
+        values, vectors = eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
         inverse = vectors[:, :, 0].reshape(-1, 3, 3)
         sent = image_points @ np.swapaxes(inverse, 1, 2)
         distance = np.abs(dots(lines, sent)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
@@ -271,7 +271,7 @@ def profile_from_lines(lines: Array, offsets: Array, unit_px: float, terms: int)
     squared = np.sum(p * p, axis=1)
     factors = np.column_stack([p, *(squared**k for k in range(terms + 1))])
     rows = (factors[:, :, None] * lines[:, None, :]).reshape(len(lines), -1)
-    products = np.linalg.eigh(rows.T @ rows)[1][6:, 0].reshape(terms + 1, 3)
+    products = eigh(rows.T @ rows)[1][6:, 0].reshape(terms + 1, 3)
     left = np.linalg.svd(products)[0][:, 0]
     return tuple(float(c / left[0]) for c in left[1:]) if abs(left[0]) > 1e-9 else (0.0,) * terms
 

@@ -55,7 +55,7 @@ class Start(Frozen, eq=True):
 
 
 @numerical("the initial estimate")
-def initialise(sights: Sights, options: Options) -> Start:
+def initialise(sights: Sights, options: Options, *, may_search: bool = True) -> Start:
     """Find an initial estimate of everything that the observations show.
 
     A camera that sees only a field, and whose principal point is not stated, may show a part of a sensor. Where the
@@ -63,13 +63,16 @@ def initialise(sights: Sights, options: Options) -> Start:
     homographies: one holds about the right quarter, and about a wrong one a search only costs time. Boards determine
     the principal point by themselves. Where a stated principal point leaves large residuals, the middle is tried.
 
+    Args:
+        may_search: whether the pose is searched for where no closed form suits the observations, which takes time.
+
     Raises:
         DegenerateError: it names the sight whose pose the observations do not determine.
     """
     least_sigmas, better = 5.0, 0.75  # residuals that are large; ratio that is better (wrong quarters: 1.3 to 20)
     share = 0.22  # distance of the quarters from the middle, as a share of the picture's size
     observations = sights.observations
-    start, places = _initialised(sights, options)
+    start, places = _initialised(sights, options, may_search=may_search)
     for name, size in observations.cameras.items():
         every = sights.numbers(camera=name)
         own = np.array([number for number in every.tolist() if number in places], dtype=np.int64)

@@ -10,7 +10,7 @@ from collections.abc import Container, Iterable, Mapping
 import numpy as np
 
 from ceres_cal.base import DegenerateError, Frozen, InputError, Pose, Poses, SolutionError, chained, inverted, replace
-from ceres_cal.base.arrays import Array, Indices, distinct, evenly
+from ceres_cal.base.arrays import Array, Indices, distinct, eigh, evenly
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.observations import Prior, Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
@@ -173,7 +173,7 @@ def _decomposed(matrix: Array) -> tuple[Indices, Array, Array, Array]:
     """The free numbers of an information matrix, their sizes, and eigenvalues and eigenvectors in units of these."""
     free = np.flatnonzero(np.diag(matrix) > 0.0)
     sizes = np.sqrt(np.diag(matrix)[free])
-    return free, sizes, *np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
+    return free, sizes, *eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
 
 
 def _sd_of(matrix: Array, number: int) -> float:

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Mask, cached_property, grid_places, rms, two_digits
+from ceres_cal.base import Array, Mask, cached_property, eigh, grid_places, rms, two_digits
 from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness, required_powers
 from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces, derivative
@@ -237,7 +237,7 @@ class Spline(Planar):
         start_weight = 1e-4  # weight of a start's roughness beside its equations
         rim = self.rim_px
         u = 2.0 * phi * np.tan(0.5 * angle) / rim
-        sizes, directions = np.linalg.eigh(bending())
+        sizes, directions = eigh(bending())
         rough = directions * np.sqrt(np.maximum(sizes, 0.0)) * start_weight
         rows = np.vstack([profile_columns(np.nan_to_num(u)), rough.T])
         return {f"g{k + 1}": rows[:, k] for k in range(COUNT)}, np.append(measured - rim * u, np.zeros(COUNT))

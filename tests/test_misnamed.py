@@ -1,0 +1,70 @@
+"""Lines of the world under wrong names, where no other observations outvote them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenery import field_scene, overhead_pose
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.misnamed import find_misnamed
+from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import ssl_field
+from ceres_cal.simulate import Disturbance, Station, simulate
+
+CAMERA = Camera((1280, 960), 900.0, (639.5, 479.5), Radial((-5e-5, 6e-7)))
+FIELD = ssl_field("B")
+
+
+def left_part(seed: int = 1) -> Observations:
+    """A camera above the left part of a field: six lines and the circle, without points."""
+    station = Station("c", overhead_pose(-2.0, -0.6, 4.2, 9.0, -6.0, 4.0))
+    scene = field_scene(FIELD, {"c": CAMERA}, {"c": station}, spacing_m=0.25, points=())
+    return simulate(scene, Disturbance(curves_sigma_px=0.4), seed).observations
+
+
+def renamed(observations: Observations, names: dict[str, str]) -> Observations:
+    curves, feature = observations.curves, observations.curves.feature.copy()
+    for name, other in names.items():
+        feature[curves.feature == FIELD.curve_index[name]] = FIELD.curve_index[other]
+    return replace(observations, curves=replace(curves, feature=feature))
+
+
+@pytest.mark.parametrize(
+    ("curve", "instead"),
+    [
+        ("HalfwayLine", "LeftGoalLine"),
+        ("BottomTouchLine", "LeftPenaltyStretch"),
+        ("CenterLine", "HalfwayLine"),
+        ("CenterCircle", "LeftGoalLine"),
+    ],
+)
+def test_exchanged_names_are_refused_and_corrected(curve: str, instead: str) -> None:
+    """The camera was found up to 4 m off after 17 s, and its right height was contradicted."""
+    right = left_part()
+    wrong = renamed(right, {curve: instead, instead: curve})
+    with pytest.raises(InputError, match=r"station 'c': .* exchange their names: correct them, or let"):
+        calibrate(wrong)
+    found = find_misnamed(wrong, Options())
+    assert found is not None and {found.curve, found.instead} == {curve, instead} and found.are_exchanged
+    assert np.array_equal(found.corrected(wrong).curves.feature, right.curves.feature)
+
+
+def test_a_line_under_the_name_of_one_that_is_not_seen() -> None:
+    right = left_part()
+    wrong = renamed(right, {"HalfwayLine": "RightPenaltyStretch"})
+    found = find_misnamed(wrong, Options())
+    assert found is not None and not found.are_exchanged
+    assert "'RightPenaltyStretch' is named 'HalfwayLine'" in found.words
+    assert np.array_equal(found.corrected(wrong).curves.feature, right.curves.feature)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_right_names_are_taken(seed: int) -> None:
+    right = left_part(seed)
+    assert find_misnamed(right, Options()) is None
+    assert np.hypot(*(calibrate(right).station("c").position[:2] - (-2.0, -0.6))) < 0.05  # 0.007 to 0.02 measured
