@@ -1,20 +1,27 @@
 """Features that have the name of another one are named, and renamed."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scenery import field_scene, overhead_pose
+from test_cli import Say, say
 
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics.diagnosis import diagnose
 from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Station, simulate
+
+__all__ = ["say"]
 
 CAMERA = Camera((1280, 960), 700.0, (639.5, 479.5), Radial((-5e-5, 6e-7)))
 
@@ -71,3 +78,13 @@ def test_a_circle_of_another_radius_is_no_wrong_label() -> None:
 
 def test_right_names_stay(right: Observations) -> None:
     assert not list(renamings(right, calibrate(right, Options(lens="radial"))))
+
+
+def test_the_command_says_it_without_another_verdict_than_python(right: Observations, say: Say, tmp_path: Path) -> None:
+    wrong = renamed(right, "point", {"CenterMark": "TopRightCorner", "TopRightCorner": "CenterMark"})
+    wrong.save(tmp_path / "wrong.json")
+    said = json.loads(say("calibrate", tmp_path / "wrong.json", "--json").out)
+    python = judge_quality(quality_of(calibrate(wrong), wrong))
+    assert (said["verdict"]["level"], said["verdict"]["headline"]) == (python.level, python.headline)
+    told = "point 'CenterMark' is seen where 'TopRightCorner' lies: taken out; --mend-labels corrects the name"
+    assert any(told in one for one in said["calibration"]["remarks"])
