@@ -117,7 +117,7 @@ def eigh(matrix: Array) -> tuple[Array, Array]:
     """
     try:
         values, vectors = np.linalg.eigh(matrix)
-    except np.linalg.LinAlgError:
+    except np.linalg.LinAlgError:  # quiet: the values are found otherwise, or this raises the same
         most = float(np.max(np.linalg.norm(matrix, axis=(-2, -1))))
         turned, sizes, _ = np.linalg.svd(matrix + most * np.eye(matrix.shape[-1]))
         return np.asarray(sizes[..., ::-1] - most), np.asarray(turned[..., ::-1])

@@ -12,8 +12,8 @@ import numpy as np
 from ceres_cal.base import at_most, checked, counted, for_small_matrices, meanwhile, numerical, replace
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, SolutionError, attempt, or_none
 from ceres_cal.calibration import Calibration, LensChoice
-from ceres_cal.calibration.misnamed import started
 from ceres_cal.calibration.outcome import of_closed_form
+from ceres_cal.calibration.renaming import started
 from ceres_cal.calibration.solving import Task, TaskSolution, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import odd_sizes, require_filled, unfilled

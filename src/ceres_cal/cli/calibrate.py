@@ -151,18 +151,18 @@ def _run(args: CalibrateArguments) -> Document:
     options = _options(args, observations, fixed=fixed, powers=powers)
     with ProgressBar(args.silent) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
-        from ceres_cal.calibration.misnamed import find_misnamed
+        from ceres_cal.calibration.renaming import find_renaming
 
         workers = {} if client is None else {"client": client}
-        misnamed = find_misnamed(observations, options) if args.mend_labels else None
-        observations = misnamed.corrected(observations) if misnamed else observations
+        renaming = find_renaming(observations, options) if args.mend_labels else None
+        observations = renaming.corrected(observations) if renaming else observations
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
         wrong = tuple(diagnostics.renamings(observations, calibration)) if calibration.rounds else ()
         if wrong and args.mend_labels:
             observations = diagnostics.mended(observations, wrong)
             calibration = calibrate(observations, options, _solve_progress(bar), **workers)
     done = "renamed" if args.mend_labels else "taken out; --mend-labels corrects the name"
-    found = [*([misnamed.words] if misnamed else []), *(diagnostics.renaming_words(one, observations) for one in wrong)]
+    found = [*([renaming.words] if renaming else []), *(diagnostics.renaming_words(one, observations) for one in wrong)]
     # Remarks, which cost no trust: beside features that were taken out, the others were as accurate as stated.
     calibration = replace(calibration, remarks=(*calibration.remarks, *(f"{words}: {done}" for words in found)))
     return files.calibrated(args, calibration, observations, photographs, args.observations)

@@ -27,8 +27,8 @@ _MOST_CURVES = 12  # of a station: of more, two are outvoted
 _FITTING, _BETTER = 0.9, 10.0
 
 
-class Misnamed(Frozen, eq=True):
-    """A curve that a station shows under another curve's name.
+class Renaming(Frozen, eq=True):
+    """Another name for a curve that a station shows under a wrong one.
 
     Attributes:
         station, target: by name. curve, instead: the name that it has, and its own. are_exchanged: whether the other
@@ -63,7 +63,7 @@ def started(sights: Sights, options: Options) -> Start:
     """Find an initial estimate.
 
     Raises:
-        InputError: many curves are far from it, and `find_misnamed` finds a wrong name.
+        InputError: many curves are far from it, and `find_renaming` finds a wrong name.
         DegenerateError: see `initialise`.
     """
     start = initialise(sights, options)
@@ -72,13 +72,13 @@ def started(sights: Sights, options: Options) -> Start:
         own = lengths[sights.of_camera(name).curve_rows]
         fitting = np.count_nonzero(own <= NO_FIT * np.hypot(*camera.image_size))  # NaN does not
         if fitting < _FITTING * len(own):
-            found = find_misnamed(sights.observations.of_camera(name), options)
+            found = find_renaming(sights.observations.of_camera(name), options)
             if found:
                 raise InputError(f"{found.words}: correct them, or let `ceres-cal calibrate --mend-labels` do so")
     return start
 
 
-def find_misnamed(observations: Observations, options: Options) -> Misnamed | None:
+def find_renaming(observations: Observations, options: Options) -> Renaming | None:
     """Return the only change of one name with which all curves fit together that some station shows of the world.
     Points beside them decide by themselves.
     """
@@ -100,14 +100,14 @@ def _of_world(observations: Observations) -> Observations:
     return observations.part(of_world[observations.points.view], of_world[observations.curves.view])
 
 
-def _candidates(observations: Observations, station: str) -> Iterator[Misnamed]:
+def _candidates(observations: Observations, station: str) -> Iterator[Renaming]:
     """Yield each observed curve under each other name."""
     for name, target in observations.targets.items():
         own = np.array([view.target == name for view in observations.views])[observations.curves.view]
         shown = [target.curve_names[number] for number in distinct(observations.curves.feature[own])]
         for number, curve in enumerate(shown if len(shown) <= _MOST_CURVES else ()):
             others = (other for other in target.curve_names if other not in shown[: number + 1])
-            yield from (Misnamed(station, name, curve, other, other in shown) for other in others)
+            yield from (Renaming(station, name, curve, other, other in shown) for other in others)
 
 
 def _off_by(observations: Observations, options: Options, *, may_search: bool = False) -> float:

@@ -8,7 +8,7 @@ from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.calibration.misnamed import find_misnamed
+from ceres_cal.calibration.renaming import find_renaming
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
@@ -49,7 +49,7 @@ def test_exchanged_names_are_refused_and_corrected(curve: str, instead: str) -> 
     wrong = renamed(right, {curve: instead, instead: curve})
     with pytest.raises(InputError, match=r"station 'c': .* exchange their names: correct them, or let"):
         calibrate(wrong)
-    found = find_misnamed(wrong, Options())
+    found = find_renaming(wrong, Options())
     assert found is not None and {found.curve, found.instead} == {curve, instead} and found.are_exchanged
     assert np.array_equal(found.corrected(wrong).curves.feature, right.curves.feature)
 
@@ -57,7 +57,7 @@ def test_exchanged_names_are_refused_and_corrected(curve: str, instead: str) -> 
 def test_a_line_under_the_name_of_one_that_is_not_seen() -> None:
     right = left_part()
     wrong = renamed(right, {"HalfwayLine": "RightPenaltyStretch"})
-    found = find_misnamed(wrong, Options())
+    found = find_renaming(wrong, Options())
     assert found is not None and not found.are_exchanged
     assert "'RightPenaltyStretch' is named 'HalfwayLine'" in found.words
     assert np.array_equal(found.corrected(wrong).curves.feature, right.curves.feature)
@@ -66,5 +66,5 @@ def test_a_line_under_the_name_of_one_that_is_not_seen() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_right_names_are_taken(seed: int) -> None:
     right = left_part(seed)
-    assert find_misnamed(right, Options()) is None
+    assert find_renaming(right, Options()) is None
     assert np.hypot(*(calibrate(right).station("c").position[:2] - (-2.0, -0.6))) < 0.05  # 0.007 to 0.02 measured
