@@ -61,6 +61,20 @@ def test_places_frames_and_what_was_not_seen() -> None:
         Observations.from_points([pixels.T], places, (640, 480))
 
 
+def test_a_frame_in_which_opencv_found_no_board() -> None:
+    """OpenCV's None ended in "pixels must have shape (N, 2), not ()", which names nothing that the user gave."""
+    found = {**{str(number): seen for number, seen in enumerate(corners())}, "none": None}
+    with_none = Observations.from_points(found, BOARD, (1280, 960))
+    unseen = Observations.from_points({**found, "none": np.full((54, 2), np.nan)}, BOARD, (1280, 960))
+    assert with_none.digest == unseen.digest and with_none.views[-1].frame == "none"
+    assert (
+        calibrate(with_none).station().phi
+        == calibrate(Observations.from_points(corners(), BOARD, (1280, 960))).station().phi
+    )
+    with pytest.raises(InputError, match="no frame shows the target"):
+        Observations.from_points([None, None], BOARD, (1280, 960))
+
+
 @pytest.mark.parametrize("given", [np.ones((4, 2)), [np.ones((480, 640, 3))], 7])
 def test_what_are_no_photographs(given: Any) -> None:
     """Pixels, or images that were read, given to `check` caused a ValueError of NumPy."""

@@ -27,8 +27,9 @@ def points_by_frame(
     frames = _frames(pixels)
     movable = target.movable if moves is None else moves
     views, seen_rows, name = [], [], _name(target) if isinstance(points, Target) else "target"
+    unseen = np.full((len(target.points), 2), np.nan)
     for number, (frame, values) in enumerate(frames.items()):
-        seen = _pixels(values, f"frame {frame!r}")
+        seen = unseen if values is None else _pixels(values, f"frame {frame!r}")
         if len(seen) != len(target.points):
             raise InputError(
                 f"frame {frame!r}: {len(seen)} pixels for {len(target.points)} points: give one for each, NaN "
@@ -40,6 +41,8 @@ def points_by_frame(
     if not seen_rows:
         raise InputError("pixels must hold at least one frame")
     view, feature, where = (np.concatenate(part) for part in zip(*seen_rows, strict=True))
+    if not len(view):
+        raise InputError("no frame shows the target: pixels of all frames are None or NaN")
     every = Points(view, feature, where, np.full(len(view), float(sigma_px)))
     return Content({name: target}, {camera: size_in(image_size)}, tuple(views), every, NO_CURVES)
 

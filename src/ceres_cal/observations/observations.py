@@ -103,7 +103,7 @@ class Observations(Content):
     @checked
     def from_points(
         cls,
-        pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
+        pixels: ArrayLike | Sequence[ArrayLike | None] | Mapping[str, ArrayLike | None],
         points: Target | ArrayLike,
         image_size: tuple[int, int],
         *,
@@ -115,7 +115,8 @@ class Observations(Content):
 
         Args:
             pixels: (N, 2) or OpenCV's (N, 1, 2) of one frame, a list of those, or a dict by name of the frame; one row
-                for each point, NaN where it was not seen.
+                for each point, NaN where it was not seen. None, OpenCV's answer where it found no board, is a frame in
+                which no point was seen.
             points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
             image_size: (width, height) px. sigma_px: standard deviation of each coordinate.
             moves: whether the target was elsewhere in every frame; by default as the target states. Places do not move:
