@@ -521,6 +521,15 @@ def test_another_size_is_another_camera(tmp_path: Path, picture: Array) -> None:
         detect_boards(images, BOARD)
 
 
+def test_the_search_ends_where_most_images_show_another_board(tmp_path: Path, picture: Array) -> None:
+    """Of all images each was searched completely, which takes seconds, for an answer that no image to come changes."""
+    paths = [write(tmp_path / f"{name}.png", photograph(picture)) for name in "abcde"]
+    looked: list[int] = []
+    with pytest.raises(InputError, match=r"6 x 6 inner corners in the first 3 of 5 images .*a\.png: .* 7 x 6 corners"):
+        detect_boards(paths, checkerboard(6, 6, 0.03), progress=lambda number, *_: looked.append(number))
+    assert looked == [1, 2, 3]
+
+
 def test_no_board_at_all(tmp_path: Path, picture: Array) -> None:
     path = write(tmp_path / "a.png", photograph(picture))
     with pytest.raises(

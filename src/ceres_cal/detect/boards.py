@@ -5,7 +5,7 @@ OpenCV finds the board; its sub-pixel search, `saddles` or `markers` then measur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
@@ -111,16 +111,21 @@ def detect_boards(
     # OpenCV's marker detectors keep state, which threads would share.
     each = in_turn if board.kind == "checkerboard" else map
     size, grids, missed = _find_all(paths, find, each, progress)
-    refuting = [one for one in missed if NO_PLACE in one[1]]
-    if len(grids) <= len(refuting):  # a board that more images refute than show is not this board
-        missed = [*refuting, *(one for one in missed if one not in refuting)]
-        seen = _markers_instead(board, Path(missed[0][0]))
-        reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}{seen}"
+    if _is_refuted(grids, missed):
+        missed.sort(key=lambda one: NO_PLACE not in one[1])
+        seen, searched = _markers_instead(board, Path(missed[0][0])), len(grids) + len(missed)
+        where = f"any of {searched}" if searched == len(paths) else f"the first {searched} of {len(paths)}"
+        reason = f"in {where} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}{seen}"
         raise NothingShownError(f"no {_what(board)} {reason}", tuple(missed))
     views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
+
+
+def _is_refuted(grids: Sized, missed: Sequence[tuple[str, str]], to_come: int = 0) -> bool:
+    """Whether at least as many images refute the board as show it, whatever the images to come show."""
+    return len(grids) + to_come <= sum(NO_PLACE in reason for _, reason in missed)
 
 
 def _what(board: Target) -> str:
@@ -141,7 +146,7 @@ def _find_all(
     paths: Sequence[Path], find: Finder, each: EachImage, progress: ImageProgress | None
 ) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
     """Return the images' (width, height), the grid in each image that shows the board, and (path, reason) of the
-    others.
+    others. The search ends where images to come cannot change that the board is another one.
     """
     size = (0, 0)
     grids: dict[Path, Array] = {}
@@ -164,6 +169,8 @@ def _find_all(
             grids[path] = grid
         if progress is not None:
             progress(number, len(paths), path.name)
+        if _is_refuted(grids, missed, len(paths) - number):
+            break
     return size, grids, missed
 
 
