@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -94,6 +95,7 @@ WRONG = {
         ("VIDEO --target ssl-b --to opencvv", "did you mean 'opencv'?"),
         ("VIDEO --target ssl-b --frames 0", "not a whole number of 1 or more"),
         ("VIDEO --target ssl-b --output PHOTO", "cannot be made: File exists"),
+        ("PHOTO COPY --target ssl-b", "0001.png: has the same name as"),
     ],
     "open": [
         ("PHOTO --target ssl-c", "did you mean 'ssl-b'?"),
@@ -116,6 +118,7 @@ WRONG = {
         ("CAL PHOTO --prior height_m=4", "write OWNER.NAME=VALUE:SIGMA"),
         ("CAL PHOTO --output nowhere/c.json", "there is no folder 'nowhere'"),
         ("CAL PHOTO --report page.pdf", "a report is written as .html or .htm"),
+        ("CAL PHOTO COPY --report OUT/page.html", "0001.png: has the same name as"),
         ("CAL PHOTO --images PHOTO", "--images needs --report"),
         ("BARE PHOTO", "does not say how well it is known"),
     ],
@@ -162,12 +165,14 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     bare = calibrate(observations, Options(lens="radial", closed_form_only=True))
     bare.save(folder / "bare.json")
     (folder / "game.mp4").write_bytes(b"a video")
+    shutil.copy(FIELD / "photographs" / "0001.jpg", folder / "0001.png")
     in_mm = {name: 1e3 * metres for name, metres in ssl_field("B").dimensions.items()}
     return {
         "OBS": str(FIELD / "observations.json"),
         "CAL": str(folder / "calibration.json"),
         "BARE": str(folder / "bare.json"),
         "PHOTO": str(FIELD / "photographs" / "0001.jpg"),
+        "COPY": str(folder / "0001.png"),
         "VIDEO": str(folder / "game.mp4"),
         "OUT": str(folder),
         "MILLIMETRES": json.dumps({"kind": "ssl-field", **in_mm}),

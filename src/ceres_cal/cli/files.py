@@ -120,6 +120,14 @@ def require_different(files: Iterable[str | Path]) -> None:
         given.add(place)
 
 
+def require_frames_apart(images: Iterable[Path]) -> None:
+    """Raise InputError for two photographs of a camera with one name: a report could not tell their frames apart."""
+    named: dict[str, Path] = {}
+    for image in images:
+        if (other := named.setdefault(base.frame_of(image), image)) != image:
+            raise InputError(f"{image}: has the same name as {other}: rename or remove one, as names identify frames")
+
+
 def read_calibration(path: Path) -> Calibration:
     """Load the calibration of a file."""
     from ceres_cal.calibration import Calibration

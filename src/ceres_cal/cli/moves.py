@@ -349,6 +349,7 @@ def _refit(args: RefitArguments) -> Document:
     images = photographs_in(args)
     # The output may replace the old calibration, as many users want.
     files.require_outputs(args, images or args.inputs)
+    files.require_frames_apart(images if args.report else ())
     calibration = files.read_calibration(args.calibration)
     observed = None if images else files.read_observations(args.inputs)
     priors = _priors(args, calibration if observed is None else observed)

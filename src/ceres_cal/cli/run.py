@@ -13,7 +13,7 @@ from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError,
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
-from ceres_cal.cli.files import attempted, folder_of_results, is_board, read_board, require_shown
+from ceres_cal.cli.files import attempted, folder_of_results, is_board, read_board, require_frames_apart, require_shown
 from ceres_cal.cli.photographs import median_text, turned_section
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
@@ -155,6 +155,7 @@ def _require_fitting(args: RunArguments, cameras: Sequence[RunArguments]) -> Non
     names = [one.camera for one in cameras]
     for one in cameras:
         images, _ = images_and_videos(one.images)
+        require_frames_apart(images)
         field = require_shown(images, args.target, args.board, args.prior, names, args.lens)
         if field is not None:
             lengths = arguments.parse_estimates(args.estimate, {"field": field})

@@ -82,8 +82,8 @@ def photographs_of(images: Iterable[Path], observations: Observations) -> dict[t
             if known.setdefault((view.frame, view.station), path) != path:
                 other = known[view.frame, view.station]
                 raise InputError(
-                    f"{path}: has the same name as {other}: give the images of one folder, or of one for each camera "
-                    "that is called like it"
+                    f"{path}: has the same name as {other}: rename or remove one, or give the images of one folder, "
+                    "or of one for each camera that is called like it"
                 )
     return known
 
