@@ -108,7 +108,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.stated", "LEVEL", "calibrate"),
     *_of("robust.usable", "_BELOW", "calibrate"),
     *_of("scene.targets.target", "HANDY_M", "calibrate"),
-    *_of("robust.other_minima", "_LOST _FEWEST", "calibrate"),
+    *_of("robust.other_minima", "LOST _FEWEST", "calibrate"),
     *_of("robust.other_minima", "_DECIDED_SIGMA _SAME _MUCH_WORSE", "calibrate"),
     *_of("robust.competing", "_STANDS_OUT", "calibrate"),
     *_of("robust.competing", "_LEFT", "calibrate"),

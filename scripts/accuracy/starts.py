@@ -5,7 +5,7 @@ a touch line, the halfway line and the circle (and the centre line), the other o
 points on each. "drawn": 2 to 8 features of a field, and a camera whose phi is known or not. Counted are refusals of
 scenes that are solvable (by the rank of finite differences of the exact scene), and calibrations in which a number
 called "known" has an error above 5 standard deviations. "labels": two points or two curves of one of ten fields with
-exchanged names. "advice": four points and 24 line points, and then each measurement that `advise` proposes, including
+exchanged names. "lines": the same of 4 to 12 curves of a part of a field, without points. "advice": four points and 24 line points, and then each measurement that `advise` proposes, including
 three poles. "clicks": four corners of each photograph of ../shared, clicked with errors of 8 px, and six of a football
 pitch seen from its stands. Exits with 1 where there are any.
 """
@@ -29,6 +29,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.renaming import find_renaming
 from ceres_cal.detect.photographs.by_hand import Clicks, starts_from_clicks
 from ceres_cal.diagnostics.advice import advise
 from ceres_cal.diagnostics.labels import mended, renamings
@@ -111,6 +112,39 @@ def _exchanged(seed: int) -> bool:
     again = mended(wrong, tuple(renamings(wrong, calibration)))
     found = getattr(again, kind).feature, again.points.feature, again.curves.feature
     return all(map(np.array_equal, found, (columns.feature, right.points.feature, right.curves.feature)))
+
+
+def lines(runs: int) -> Iterator[Row]:
+    found = [one for one in over(_lines, range(runs)) if one]
+    share = found.count("mended") / len(found)
+    yield Row("lines", f"exchanged in pairs, named and mended, share of {len(found)}", share, least=0.7)
+    yield Row("lines", "other names given", found.count("other"), most=0)
+    yield Row("lines", "right names doubted", found.count("doubted"), most=0)
+
+
+def _lines(seed: int) -> str:
+    """What is said of two exchanged curves of a part of a field: "mended", "other" names, or "nothing"; "doubted" where
+    the right names are; "" where more or fewer curves are shown.
+    """
+    rng, most = np.random.default_rng([seed, 28]), 12
+    field = ssl_field("AB"[seed % 2])
+    camera = Camera(_SIZE, rng.uniform(700.0, 1000.0), (639.5, 511.5), Radial((rng.uniform(-6e-5, 0.0), 5e-7)))
+    x, y, height = rng.uniform(-2.5, 2.5), rng.uniform(-2.0, 2.0), rng.uniform(4.0, 5.5)
+    pose = overhead_pose(x, y, height, rng.uniform(-12.0, 12.0), rng.uniform(-12.0, 12.0))
+    scene = field_scene(field, {"c": camera}, {"c": Station("c", pose)}, points=(), spacing_m=0.2)
+    right = simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), seed).observations
+    curves = right.curves
+    if not 4 <= len(np.unique(curves.feature)) <= most:
+        return ""
+    if find_renaming(right, Options()):
+        return "doubted"
+    first, second = rng.permutation(np.unique(curves.feature))[:2]
+    feature = curves.feature.copy()
+    feature[curves.feature == first], feature[curves.feature == second] = second, first
+    wrong = replace(right, curves=replace(curves, feature=feature))
+    found = find_renaming(wrong, Options())
+    mended_now = found is not None and np.array_equal(found.corrected(wrong).curves.feature, curves.feature)
+    return "mended" if mended_now else "other" if found else "nothing"
 
 
 def advice(runs: int) -> Iterator[Row]:
@@ -342,6 +376,7 @@ main = script(
         "quarter": quarter,
         "drawn": drawn,
         "labels": labels,
+        "lines": lines,
         "advice": advice,
         "clicks": clicks,
     },

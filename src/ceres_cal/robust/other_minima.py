@@ -118,9 +118,10 @@ def mirrored(sights: Sights, poses: Array) -> Array:
     return np.concatenate([rotations, translations[:, :, None]], axis=2)
 
 
-# Share of a sight's observations in use below which its pose counts as lost. Of 40 boards before a fisheye with 30 %
-# outliers, 9 end in a wrong pose, and 19 at 0.33; at 0.67 nothing changes.
-_LOST = 0.5
+LOST = 0.5
+"""Share of a sight's observations in use below which its pose counts as lost. Of 40 boards before a fisheye with 30 %
+outliers, 9 end in a wrong pose, and 19 at 0.33; at 0.67 nothing changes.
+"""
 # Least number of points for a consensus: four determine a pose, and two more hardly ever agree by chance. Halving or
 # doubling changes nothing.
 _FEWEST = 6
@@ -133,7 +134,7 @@ def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimat
         problem: of all observations, including rejected ones, weighted with a loss that tolerates outliers.
     """
     sights, weighting, count = problem.sights, problem.weighting, 0
-    for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):
+    for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < LOST):
         sight = sights[int(number)]
         pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in problem.layout.placements else None
         if pose is None:
@@ -157,7 +158,7 @@ def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimat
 def lost_rows(problem: Problem, inliers: Inliers) -> Mask:
     """(N + M,) the observations of lost placements. The few that agree with such a pose do so by chance."""
     sights, rows = problem.sights, np.zeros_like(inliers.rows)
-    lost = np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST)
+    lost = np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < LOST)
     own = sights.take(np.array([i for i in lost if sights.keys[i].placement in problem.layout.placements], np.int64))
     rows[own.point_rows] = rows[len(inliers.points) + own.curve_rows] = True
     return rows

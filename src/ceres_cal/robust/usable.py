@@ -22,6 +22,7 @@ from ceres_cal.effects import AsBuilt
 from ceres_cal.observations import Observations, SightKey, Sights
 from ceres_cal.problem import Estimate, Problem, Residuals, floor_of
 from ceres_cal.robust.noise import Inliers
+from ceres_cal.robust.other_minima import LOST
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -236,7 +237,7 @@ def lost_sights(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> I
         used |= rows
     sights = problem.sights
     shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
-    lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < 0.5)]
+    lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < LOST)]
     otherwise: Mapping[tuple[str, str], str] = {}
     if any(key.placement not in (None, *sights.seen_once) for key, _ in lost):  # shared by a rig
         from ceres_cal.start.same_moments import shown_otherwise
