@@ -63,6 +63,24 @@ def test_rays_are_where_the_points_are(camera: Camera) -> None:
 
 
 @quick
+@given(cameras(), st.floats(0.7, 1.4))
+def test_a_zoom_enlarges_the_picture_or_leaves_displacements(camera: Camera, ratio: float) -> None:
+    rays, middle = (
+        np.array([(x, y, 1.0) for x in (-0.3, 0.1, 0.4) for y in (-0.2, 0.0, 0.3)]),
+        np.array(camera.principal_point),
+    )
+    by_angle, by_place = camera.zoomed(ratio * camera.phi)
+    own = camera.at(Pose.identity()).project(rays)
+    larger = by_angle.at(Pose.identity()).project(rays)
+    shown = np.isfinite(own) & np.isfinite(larger)
+    assert np.allclose((larger - middle)[shown], ratio * (own - middle)[shown], atol=1e-6)
+    assert camera.lens.values in (by_angle.lens.values, by_place.lens.values)
+    if camera.lens.acts_on_pixels:
+        assert by_place.lens == camera.lens
+    else:
+        assert by_angle.lens == camera.lens
+
+
 @given(cameras(), st.floats(0.5, 2.0))
 def test_aspect_stretches_the_rows(camera: Camera, factor: float) -> None:
     _, points = seen_points(camera)

@@ -1,13 +1,14 @@
 """Scenes for which an initial estimate must be found: python scripts/run.py starts [--help]
 
-"middle" and "quarter": cameras of a division A field as in halls, with and without a stated height. The middle one sees
-a touch line, the halfway line and the circle (and the centre line), the other one lines of a quarter's corner, with 30
-points on each. "drawn": 2 to 8 features of a field, and a camera whose phi is known or not. Counted are refusals of
-scenes that are solvable (by the rank of finite differences of the exact scene), and calibrations in which a number
-called "known" has an error above 5 standard deviations. "labels": two points or two curves of one of ten fields with
-exchanged names. "lines": the same of 4 to 12 curves of a part of a field, without points. "advice": four points and 24 line points, and then each measurement that `advise` proposes, including
-three poles. "clicks": four corners of each photograph of ../shared, clicked with errors of 8 px, and six of a football
-pitch seen from its stands. Exits with 1 where there are any.
+"middle" and "quarter": cameras of a division A field as in halls, with and without a stated height. The middle one
+sees a touch line, the halfway line and the circle (and the centre line), the other one lines of a quarter's corner,
+with 30 points on each. "drawn": 2 to 8 features of a field, and a camera whose phi is known or not. Counted are
+refusals of scenes that are solvable (by the rank of finite differences of the exact scene), and calibrations in which
+a number called "known" has an error above 5 standard deviations. "labels": two points or two curves of one of ten
+fields with exchanged names. "lines": the same of 4 to 12 curves of a part of a field, without points. "advice": four
+points and 24 line points, and then each measurement that `advise` proposes, including three poles. "clicks": four
+corners of each photograph of ../shared, clicked with errors of 8 px, and six of a football pitch seen from its
+stands. Exits with 1 where there are any.
 """
 
 from __future__ import annotations

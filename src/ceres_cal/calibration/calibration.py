@@ -31,10 +31,12 @@ from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.files import PosteriorFile
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, GaussianPrior, Key, Options, every_key, gather_priors, make_layout, redrawn
+from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import intrinsic_keys
 from ceres_cal.robust.stated import Conflict, agreed
 from ceres_cal.robust.unsteady import without_unsteadiness
-from ceres_cal.scene import Camera, CameraFile, PoseFile, Target, targets_from_specs
+from ceres_cal.scene import Camera, CameraFile, Lens, PoseFile, Target, targets_from_specs
 
 if TYPE_CHECKING:
     from ceres_cal.posterior.seam import Disagreement
@@ -209,8 +211,10 @@ class Calibration(Frozen):
                 options.
         """
         observations, options = self.as_taken(observations), self.options
-        sights = gather_sights(observations)
-        prior = None if self.refitted is None else self.refitted.prior
+        sights, about = gather_sights(observations), self.refitted
+        moved = {self.estimate.stations[name].camera for name in (about.moved if about else ())}
+        changed = {name: self.cameras[name] for name in moved}
+        prior = None if about is None else still_known(about.prior, about.what, changed)
         weighting = Weighting(*self.fit.scales, options.loss, options.loss_scale)
         if new_data or prior is None or self.posterior is None:
             priors = gather_priors(observations, options, self.estimate.structure)
@@ -307,3 +311,32 @@ def _rows_of(entries: Iterable[Rejection], observations: Observations) -> tuple[
     for entry in entries:
         masks[entry.kind == "curve"][entry.row] = True
     return masks
+
+
+def loosened(what: str, camera: str, lens: Lens) -> frozenset[Key]:
+    """Return the intrinsics of a camera about which a refit of `what` assumes nothing."""
+    which = {"zoom": ("phi",), "iris": lens.names, "everything": intrinsic_names(lens)}.get(what, ())
+    return frozenset(key for key in intrinsic_keys(camera, lens) if key.quantity in which)
+
+
+def still_known(prior: GaussianPrior, what: str, cameras: Mapping[str, Camera]) -> GaussianPrior:
+    """Return what counts of a prior after `what` has changed of some cameras. After another zoom, coefficients are
+    known as far as both ways agree in which a lens may change with it.
+
+    Args:
+        cameras: those that changed, with the phi that they have now.
+    """
+    mean, half = prior.mean.copy(), np.zeros(len(prior.keys))
+    for name, camera in cameras.items() if what == "zoom" else ():
+        known = {key.quantity: i for i, key in enumerate(prior.keys) if key[:2] == ("camera", name)}
+        if "phi" not in known:
+            continue
+        values = dict(zip(camera.lens.names, camera.lens.values, strict=True))
+        values |= {one: float(mean[i]) for one, i in known.items() if one in values}
+        before = camera.lens.with_values([*values.values()])
+        both = np.array([lens.values for lens in before.after_zoom(camera.phi / float(mean[known["phi"]]))])
+        own = [known[one] for one in values if one in known]
+        there = [i for i, one in enumerate(values) if one in known]
+        mean[own], half[own] = both.mean(axis=0)[there], 0.5 * np.diff(both, axis=0)[0][there]
+    gone = frozenset().union(*(loosened(what, name, camera.lens) for name, camera in cameras.items()))
+    return replace(prior, information=prior.information.widened(half[None]), mean=mean).without(gone)

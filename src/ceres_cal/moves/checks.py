@@ -15,6 +15,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, checked, numerical, or_none, replace
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibration import loosened
 from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.agreement import (
     FALSE_ALARMS,
@@ -44,7 +45,6 @@ from ceres_cal.moves.poses import (
     moved_words,
     pose_candidates,
 )
-from ceres_cal.moves.refit_plan import loosened
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.problem import Estimate, Information, Key, Problem, Weighting, layout_of, solve
 from ceres_cal.problem.priors import GaussianPrior, tolerances

@@ -193,10 +193,10 @@ def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Pose
     for width in (2.0, 1.05, 1.008):  # each grid is finer, around the best of the one before
         middle = search.camera.phi if best is None else best[0].camera.phi
         for phi in middle * np.geomspace(1.0 / width, width, zooms):
-            zoomed = search.with_camera(replace(search.camera, phi=float(phi)))
-            for candidate in pose_candidates(zoomed, old, patience=0)[:1]:
-                if best is None or candidate.misfit < best[1].misfit:
-                    best = zoomed, candidate
+            for zoomed in map(search.with_camera, search.camera.zoomed(float(phi))):
+                for candidate in pose_candidates(zoomed, old, patience=0)[:1]:
+                    if best is None or candidate.misfit < best[1].misfit:
+                        best = zoomed, candidate
     return best if best is not None and best[1].share >= _HALF else None
 
 
@@ -228,7 +228,7 @@ class RefitVerdict(Frozen, eq=True):
 
 def judged(plan: RefitPlan, what: str, result: Calibration) -> RefitVerdict:
     """Return strain and noise of a result."""
-    off = plan.prior_for(what).residuals(result.estimate)
+    off = plan.prior_for(what, result.estimate).residuals(result.estimate)
     fit, (points, curves) = result.fit, plan.scales
     ratios = ((fit.points, fit.point_scale / points), (fit.curves, fit.curve_scale / curves))
     noise = [ratio for count, ratio in ratios if count]

@@ -11,13 +11,14 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, InputError, Pose, no_such, replace
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibration import loosened, still_known
 from ceres_cal.moves.agreement import matched, require_posterior
 from ceres_cal.observations import Observations, Prior, Sights, gather_sights
-from ceres_cal.problem import GaussianPrior, Problem, gather_priors, intrinsic_keys, require_possible_numbers
+from ceres_cal.problem import GaussianPrior, Problem, gather_priors, require_possible_numbers
 from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
 from ceres_cal.problem.quantities import natural_sizes
-from ceres_cal.scene import TURNED, Lens, Target, counterparts, target_from_spec
+from ceres_cal.scene import TURNED, Target, counterparts, target_from_spec
 
 
 def relabelled(observations: Observations, image: Array) -> Observations | None:
@@ -131,9 +132,9 @@ class RefitPlan(Frozen):
         cameras = self.calibration.cameras
         return frozenset().union(*(loosened(what, name, cameras[name].lens) for name in self.moved_cameras))
 
-    def prior_for(self, what: str) -> GaussianPrior:
-        """Return the prior with these intrinsics freed."""
-        return self.prior.without(self.loosened(what))
+    def prior_for(self, what: str, near: Estimate) -> GaussianPrior:
+        """Return the prior with these intrinsics freed. `near`: with the phi that cameras have now."""
+        return still_known(self.prior, what, {name: near.cameras[name] for name in self.moved_cameras})
 
     def usual(self, what: str) -> GaussianPrior:
         """Return a prior by which freed numbers have changed by about the usual amount, or by far more."""
@@ -142,12 +143,6 @@ class RefitPlan(Frozen):
         return replace(
             GaussianPrior.about(Information.of_sigmas(dict(zip(gone, sigmas, strict=True))), self.known), gives_way=True
         )
-
-
-def loosened(what: str, camera: str, lens: Lens) -> frozenset[Key]:
-    """Return the intrinsics of a camera about which a refit of `what` assumes nothing."""
-    which = {"zoom": ("phi",), "iris": lens.names, "everything": intrinsic_names(lens)}.get(what, ())
-    return frozenset(key for key in intrinsic_keys(camera, lens) if key.quantity in which)
 
 
 def make_plan(
@@ -257,7 +252,9 @@ def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem,
     moving = plan.moved if plan.asked.hold_others else stations
     solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=moving)
     cameras = plan.calibration.cameras
-    priors = gather_priors(plan.sights.observations, plan.options, start.structure, plan.prior_for(what), cameras)
+    priors = gather_priors(
+        plan.sights.observations, plan.options, start.structure, plan.prior_for(what, start), cameras
+    )
     if what != plan.what and plan.loosened(what):
         priors = (*priors, plan.usual(what))
     return Problem(plan.sights, solved, priors, options=plan.options), known

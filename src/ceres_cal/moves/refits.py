@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base import CalibrationError, DegenerateError, Pose, SolutionError, attempt, checked, numerical, replace
 from ceres_cal.calibration import Calibration, RefitRecord
+from ceres_cal.calibration.calibration import loosened
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
     WORDS,
@@ -40,7 +41,7 @@ from ceres_cal.moves.poses import (
     movement,
     pose_candidates,
 )
-from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, loosened, make_plan, refit_problem
+from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, make_plan, refit_problem
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.posterior import OtherLenses, with_other_lenses
 from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting, difference
@@ -168,9 +169,16 @@ def _refitted(
     phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
 
     def solved_with(what: str, start: Estimate, *, tested: bool = True) -> Calibration:
-        problem, known = refit_problem(plan, what, start)
-        task = Task(progress, tested=tested, before=known, scales=plan.scales)
-        return solved_from(task, Start(start, phi_from), problem)
+        near, most = 1e-3, 3  # share of phi that moves no coefficient by its standard deviation; number of solves
+        for _ in range(most):
+            problem, known = refit_problem(plan, what, start)
+            task = Task(progress, tested=tested, before=known, scales=plan.scales)
+            found = solved_from(task, Start(start, phi_from), problem)
+            ratios = [found.cameras[name].phi / start.cameras[name].phi for name in plan.moved_cameras]
+            if what != "zoom" or all(abs(ratio - 1.0) < near for ratio in ratios):
+                break
+            start = found.estimate  # what is known of coefficients depends on the zoom
+        return found
 
     result = solved_with(what, estimate)
     try:
@@ -271,12 +279,14 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     """Widen the posterior by lenses that predicted as well before, with the poses from which they see the new
-    observations: one picture determines a lens's numbers, but not which lens it is. After another zoom or iris the
-    other lenses are unknown.
+    observations: one picture determines a lens's numbers, but not which lens it is. After another zoom each distorts
+    rays at the same angle as before; after another iris the other lenses are unknown.
     """
     known = plan.calibration.uncertainty.posterior
-    if result.posterior is None or len(known.lenses) < 2 or plan.loosened(plan.what):
+    if result.posterior is None or len(known.lenses) < 2 or plan.what in ("iris", "everything"):
         return result
+    ratios = {name: camera.phi / plan.calibration.cameras[name].phi for name, camera in result.cameras.items()}
+    ratios = {name: ratio if plan.what == "zoom" else 1.0 for name, ratio in ratios.items()}
     sights = gather_sights(plan.sights.observations.part(*result.inlier_masks(plan.sights.observations)))
     problem, layout = refit_problem(plan, "pose-only", result.estimate)
     _, *said = problem.priors
@@ -290,7 +300,9 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     starts = [
         replace(
             result.estimate,
-            cameras={name: lens.cameras[name] for name in result.cameras},
+            cameras={
+                name: lens.cameras[name].zoomed(ratio * lens.cameras[name].phi)[0] for name, ratio in ratios.items()
+            },
             stations={**result.estimate.stations, **{name: lens.stations[name] for name in stays}},
         )
         for lens in known.lenses

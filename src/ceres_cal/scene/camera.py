@@ -130,6 +130,11 @@ class Camera(Frozen, eq=True):
         """Return the same camera at another pose."""
         return replace(self, cam_from_world=cam_from_world)
 
+    def zoomed(self, phi: float) -> tuple[Camera, Camera]:
+        """Return the same camera with another phi, with each of the lenses of `Lens.after_zoom`."""
+        by_angle, by_place = self.lens.after_zoom(phi / self.phi)
+        return replace(self, phi=phi, lens=by_angle), replace(self, phi=phi, lens=by_place)
+
     @property
     def corner_radius(self) -> float:
         """Distance (px, square pixels) from the principal point to the farthest image corner."""

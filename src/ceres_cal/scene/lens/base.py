@@ -216,6 +216,16 @@ class Lens(ABC):
         """The unit of each coefficient."""
         return tuple(["1" if power == 0 else "px" if power == 1 else f"px^{power}" for power in self.lengths])
 
+    def after_zoom(self, ratio: float) -> tuple[Lens, Lens]:
+        """Return the lens after phi has changed by a ratio, if it distorts rays at the same angle as before, as where a
+        picture is enlarged, and if it displaces the same places of the picture by as much as before. Zoom lenses do
+        something in between.
+        """
+        powers = np.array(self.orders, dtype=float) - 1.0
+        powers = -powers if self.acts_on_pixels else powers
+        other = self.with_values(np.array(self.values) * ratio**powers)
+        return (other, self) if self.acts_on_pixels else (self, other)
+
     @property
     def formula(self) -> str:
         """The model in one line, for the report; empty where one line is not enough."""
