@@ -28,13 +28,14 @@ from ceres_cal.effects.table.camera import motion_columns
 from ceres_cal.observations import NO_POINTS
 from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
+from ceres_cal.report.document import Document
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, noise_ratio, reaches, worst
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.quality import Material, quality_of
 from ceres_cal.report.residual_pictures import significant_means
 from ceres_cal.report.scale import COLORS, MM, PX
 from ceres_cal.report.solve_pictures import ideal_radii
-from ceres_cal.report.summary import verdict_chapter
+from ceres_cal.report.summary import calibration_sections, verdict_chapter
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, simulate
@@ -270,6 +271,14 @@ def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
     many = Observations(observations.targets, observations.cameras, tuple(views), *copies)  # type: ignore[arg-type]
     few = quality_of(calibration, many).diagnosis
     assert few is not None and few.new_data and 1000 < len(few.table) <= 5_500 < 4 * 2271
+
+
+def test_findings_name_a_command_that_can_be_run() -> None:
+    """`diagnose` takes files of observations, and `refit new.jpg` writes none."""
+    quality = quality_of(*sample())
+    for is_observed_now, where in ((False, "`ceres-cal diagnose`"), (True, r"the report \(--report PAGE\)")):
+        sections = calibration_sections(quality, ["new"], is_observed_now=is_observed_now)
+        assert re.search(rf"\d findings?: {where} says what to do", Document(tuple(sections)).text())
 
 
 def test_a_fault_that_moves_places_by_little_is_counted() -> None:

@@ -324,11 +324,13 @@ def calibrated(
     photographs: report.FramePhotographs | None,
     names: Sequence[str],
     *before: Section,
+    is_observed_now: bool = False,
 ) -> Document:
-    """Write a calibration and its report; return the document on it. `names`: of the observations. `before`: sections
-    that come first.
+    """Write a calibration and its report; return the document on it. `names`: of the observations, or of photographs
+    where these are observed now. `before`: sections that come first.
     """
     page, unmade = report_page(args, calibration, observations, photographs)
-    answer = report.calibration_sections(report.quality_of(calibration, observations), names)
+    quality = report.quality_of(calibration, observations)
+    answer = report.calibration_sections(quality, names, is_observed_now=is_observed_now)
     unwritten, written = write_results(args, calibration.save, page)
     return Document((*before, *answer, unmade, unwritten, written), 1 if unmade.data or unwritten.data else 0)

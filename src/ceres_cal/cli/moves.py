@@ -371,7 +371,10 @@ def _refit(args: RefitArguments) -> Document:
     moved = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in every}
     explained = {"what": about.what, "explanation": about.explanation, "moved": moved}
     first = Section("refit", about.explanation.split("; "), explained)
-    return files.calibrated(args, result, observations, photographs, args.inputs, first, shown(detections))
+    before = first, shown(detections)
+    return files.calibrated(
+        args, result, observations, photographs, args.inputs, *before, is_observed_now=detections is not None
+    )
 
 
 def _priors(args: RefitArguments, known: Calibration | Observations) -> tuple[Prior, ...]:

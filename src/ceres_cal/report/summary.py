@@ -32,8 +32,12 @@ _MEANING = (
 )
 
 
-def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Section]:
-    """Yield the answer of `calibrate` and `refit`; `inputs`: the files of observations."""
+def calibration_sections(
+    quality: Quality, inputs: Sequence[str], *, is_observed_now: bool = False
+) -> Iterator[Section]:
+    """Yield the answer of `calibrate` and `refit`; `inputs`: the files of observations, or photographs where these are
+    observed now, so that no file has the observations.
+    """
     calibration, observations = quality.calibration, quality.observations
     read = {"inputs": list(inputs), "counts": observations.counts, "calibration": calibration.to_file()}
     yield Section("read", [", ".join(map(str, inputs)), *observed(observations)], read)
@@ -44,17 +48,18 @@ def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Se
     warned = list(warnings(calibration))
     yield Section(data={"warnings": warned})
     yield from (Section("warning", wrapped(text)) for text in warned)
-    yield _verdict(quality)
+    yield _verdict(quality, is_observed_now)
 
 
-def _verdict(quality: Quality) -> Section:
+def _verdict(quality: Quality, is_observed_now: bool) -> Section:
     """Section with the headline of the report and its causes that were not stated before."""
     data, findings = _judged(quality), quality.findings
     cause = grounds.disputed(quality)
     named = [one for one in findings if grounds.is_against(one) and not cause][:_MOST_FINDINGS]
     lines = [data["headline"], *(f"{one.kind}: {one.sentence}" for one in named)]
     if findings:
-        whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
+        where = "the report (--report PAGE)" if is_observed_now else "`ceres-cal diagnose`"
+        whence = " may follow from that" if cause else f": {where} says what to do"
         lines.append(f"{plural(len(findings), 'finding')}{whence}")
     return Section("verdict", lines, {"verdict": {**data, "findings": findings}})
 
