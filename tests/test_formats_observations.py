@@ -39,7 +39,9 @@ def test_the_command_takes_the_formats_options(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / "corners.vnl").write_text(CORNERS)
     ask = ["import", str(tmp_path / "corners.vnl"), "-o", str(tmp_path / "o.json"), "--columns", "3", "--rows", "2"]
     assert main(ask) == 2
-    assert "the file does not describe the board" in capsys.readouterr().err
+    assert "give columns, rows and square (--columns N --rows N --square M)" in capsys.readouterr().err
+    assert main([*ask, "--square", "0.1"]) == 2
+    assert "give image_size (--image-size) as WIDTHxHEIGHT" in capsys.readouterr().err
     assert main([*ask, "--square", "0.1", "--image-size", "640x480"]) == 0
     assert "5 points and 0 curve observations in 1 view\n" in capsys.readouterr().out
     assert len(Observations.load(tmp_path / "o.json").points) == 5
@@ -56,10 +58,18 @@ SPREADSHEET = TABLE.replace(",", ";").replace(".", ",").replace("100;50", "100,0
 
 
 @pytest.mark.parametrize(
-    "table", [TABLE, "\ufeff" + TABLE.replace("\n", "\r\n"), SPREADSHEET, SPREADSHEET.replace(";", "\t")]
+    "table",
+    [
+        TABLE,
+        "\ufeff" + TABLE.replace("\n", "\r\n"),
+        SPREADSHEET,
+        SPREADSHEET.replace(";", "\t"),
+        TABLE.replace(",", ", "),
+        "# by hand; on Monday\n#\n" + TABLE,
+    ],
 )
 def test_named_columns(tmp_path: Path, table: str) -> None:
-    """With any separator that spreadsheets use."""
+    """With any separator that spreadsheets use, blanks after it, and comments above."""
     (tmp_path / "a.csv").write_text(table, newline="")
     seen = import_observations(tmp_path / "a.csv", target="ssl-b", image_size="640x480")
     assert [view.frame for view in seen.views] == ["1", "2"] and seen.views[0].placement is None
@@ -135,7 +145,10 @@ def test_keypoints_of_colmap_lose_their_half_pixel(tmp_path: Path) -> None:
         ("a.csv", "x_px,y_px,point\n1,2,Nose", "line 2: there is no feature 'Nose'"),
         ("a.csv", "x_px,y_px,point\n1,2,CentreMark", "no feature 'CentreMark': did you mean 'CenterMark'?"),
         ("a.csv", "x_px,y_px,point\n1,z,CenterMark", "line 2: y_px is not a finite number, but 'z'"),
+        ("a.csv", "# hand\nx_px,y_px,point\n\n1,z,CenterMark", "line 4: y_px is not a finite number, but 'z'"),
         ("a.csv", "x_px,y_px,point\n", "it holds no row"),
+        ("a.csv", "x_px,y_px,point,curve\n1,2,CenterMark,CenterLine", "line 2 names both a point and a curve"),
+        ("a.csv", "x_px,y_px,point\n1,2,", "line 2 names neither a point nor a curve"),
         ("a.csv", "point,x_px,y_px\nCenterMark,102,4,800,1", "line 2 has more values than there are columns"),
         ("a.npz", "hello", "not an NPZ file"),
         ("a.csv", "x_px,x_px,y_px\n1,2,3", "a column is there twice"),

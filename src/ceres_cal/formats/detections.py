@@ -34,7 +34,9 @@ def _read_corners(
 ) -> Observations:
     """Read `# filename x y level`, one line for each corner, row by row; '-' or a level below 0 means not found."""
     if min(columns, rows) < 2 or not square > 0.0:
-        raise InputError("the file does not describe the board: give columns, rows and square (m)")
+        raise InputError(
+            "the file does not describe the board: give columns, rows and square (--columns N --rows N --square M)"
+        )
     board = checkerboard(columns, rows, square)
     found: dict[str, list[tuple[float, float, float]]] = {}
     for number, line in enumerate(request.text.splitlines(), start=1):
@@ -71,40 +73,45 @@ _BYTES_PER_CELL = 150  # bytes of memory for a cell of a row by names
 _ZIP = b"PK"  # first bytes of an NPZ file
 
 
-def _csv_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
-    """Return rows by names, and the names. Columns may be separated by semicolons or tabs, as in spreadsheets with
-    decimal commas; commas are then read as decimal points.
+def _csv_rows(request: ImportRequest) -> tuple[Mapping[int, dict[str, Any]], Sequence[str]]:
+    """Return rows by names, each under the number of its line, and the names. Comments may precede the names. Columns
+    may be separated by semicolons or tabs, as in spreadsheets with decimal commas; commas are then read as decimal
+    points.
     """
-    head = request.content.partition(b"\n")[0]
-    between = next((mark for mark in (",", ";", "\t") if mark.encode() in head), ",")
-    marks = request.content.count(between.encode()) + request.content.count(b"\n")
+    marks = max(map(request.content.count, (b",", b";", b"\t"))) + request.content.count(b"\n")
     require_room(_BYTES_PER_CELL * marks + 2.0 * len(request.content), str(request.path))
-    reader = csv.DictReader(io.StringIO(request.text, newline=None), restval="", delimiter=between)
+    lines = [*io.StringIO(request.text, newline=None)]
+    above = next((number for number, line in enumerate(lines) if not line.startswith("#")), 0)
+    between = next((mark for mark in (",", ";", "\t") if lines and mark in lines[above]), ",")
+    reader = csv.DictReader(lines[above:], restval="", delimiter=between, skipinitialspace=True)
+    rows: dict[int, dict[str, Any]] = {}
     try:
-        rows, names = list(reader), tuple(reader.fieldnames or ())
+        names = reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+        for row in reader:
+            rows[above + reader.line_num] = row
     except csv.Error as error:
-        raise InputError(f"not a CSV file (line {reader.line_num}): {error}") from None
-    if longer := next((number for number, row in enumerate(rows, start=2) if None in row), 0):
+        raise InputError(f"not a CSV file (line {above + reader.line_num}): {error}") from None
+    if longer := next((number for number, row in rows.items() if None in row), 0):
         raise InputError(
             f"line {longer} has more values than there are columns: put names with commas into quotes, and write "
             "semicolons between the columns where decimals have a comma"
         )
     for name in names if between != "," else ():
         if name.endswith(("_px", "_m")):
-            for row in rows:
+            for row in rows.values():
                 row[name] = row[name].replace(",", ".")
     return rows, names
 
 
-def _npz_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
-    """Return rows by names, and the names."""
+def _npz_rows(request: ImportRequest) -> tuple[Mapping[int, dict[str, Any]], Sequence[str]]:
+    """Return rows by names, each under its number, and the names."""
     columns = read_foreign_npz(request.content, str(request.path))
     require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
     lengths = {array.shape for array in columns.values()}
     if len(lengths) != 1 or any(len(shape) != 1 for shape in lengths):
         raise InputError(f"the columns must be one-dimensional and of equal length, not {sorted(lengths)}")
     rows = [dict(zip(columns, map(str, row), strict=True)) for row in zip(*columns.values(), strict=True)]
-    return rows, tuple(columns)
+    return dict(enumerate(rows, start=2)), tuple(columns)
 
 
 def _read_table(
@@ -126,11 +133,14 @@ def _read_table(
         raise InputError(f"column {missing[0]} is missing")
     if not rows:
         raise InputError("it holds no row")
-    places = [_place(row, number) for number, row in enumerate(rows, start=2)] if "X_m" in names else []
-    drawn = _target(target, places, moves)
+    places = {number: _place(row, number) for number, row in rows.items()} if "X_m" in names else {}
+    drawn = _target(target, [*places.values()], moves)
     views: dict[View, int] = {}
     points, curves = [], []
-    for number, row in enumerate(rows, start=2):
+    for number, row in rows.items():
+        if not places and bool(row.get("curve")) == bool(row.get("point")):
+            which = "both a point and a curve" if row.get("point") else "neither a point nor a curve"
+            raise InputError(f"line {number} names {which}: a row shows one of them")
         view = views.setdefault(_view(row, camera, moves=moves or drawn.movable), len(views))
         pixel = [_number(row, name, number) for name in ("x_px", "y_px")]
         sigma = _number(row, "sigma_px", number) if row.get("sigma_px") else 1.0
@@ -140,7 +150,7 @@ def _read_table(
                 raise InputError(f"line {number}: side {side!r} is unknown: {', '.join(SIDES)}")
             curves.append((view, _index(drawn.curve_index, row["curve"], number), pixel, sigma, SIDES[side]))
         else:
-            name = _place_name(places[number - 2]) if places else row.get("point") or ""
+            name = _place_name(places[number]) if places else row.get("point") or ""
             points.append((view, _index(drawn.point_index, name, number), pixel, sigma))
     points.sort(key=lambda one: one[0])
     curves.sort(key=lambda one: one[0])
@@ -169,7 +179,9 @@ def _target(name: str, places: Sequence[tuple[float, float, float]], moves: bool
         return of_places({_place_name(place): place for place in places}, moves=moves)
     if (known := target_named(name)) is None:
         what = f"target {name!r} is unknown" if name else "the target of these features is not given"
-        raise InputError(f"{what}: give a target, one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
+        raise InputError(
+            f"{what}: give a target (--target), one of {', '.join(targets_by_name())}, or columns X_m, Y_m"
+        )
     return known
 
 

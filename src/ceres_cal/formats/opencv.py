@@ -166,7 +166,9 @@ def parse_size(text: str) -> tuple[int, int]:
     """Parse WIDTHxHEIGHT; InputError where it is invalid."""
     found = re.fullmatch(r"\s*(\d+)\s*[xX,]\s*(\d+)\s*", text)
     if not found:
-        raise InputError("the image size is not there: give image_size as WIDTHxHEIGHT, such as 1280x960")
+        raise InputError(
+            "the image size is not there: give image_size (--image-size) as WIDTHxHEIGHT, such as 1280x960"
+        )
     return int(found[1]), int(found[2])
 
 
