@@ -22,6 +22,7 @@ from ceres_cal.scene.targets import checkerboard
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "ssl_field"
 PHOTOGRAPH = str(SAMPLE / "photographs" / "0001.jpg")
+CHARUCO = '{"kind": "charuco", "columns": 9, "rows": 6, "square_m": 0.04, "marker_m": 0.03}'
 FIELD = ("--target", "ssl-b", "--facing", "LeftGoalLine=top")
 
 
@@ -102,6 +103,8 @@ def test_boards_alone_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[s
     [
         (("x.jpg",), "say what the photographs show: --target ssl-b, --board 9x6x25mm, or both"),
         ((PHOTOGRAPH, "--board", "9x6"), "board '9x6': write COLUMNSxROWSxSQUARE"),
+        ((PHOTOGRAPH, "--board", CHARUCO), "--board: 'dictionary' is missing"),
+        ((PHOTOGRAPH, "--target", CHARUCO), "--target: 'dictionary' is missing"),
         (("x.jpg", "--target", "ssl-b"), "x.jpg: no such file"),
         ((PHOTOGRAPH, "--target", "ssl-b", "--to", "atlantis"), "there is no export format 'atlantis'"),
     ],

@@ -37,7 +37,7 @@ def is_board(text: str) -> bool:
 
 def read_board(text: str) -> scene.Target:
     """Return the board of `--board`: COLUMNSxROWSxMM, or described as for `--target`."""
-    return read_target(text, "board") if is_described(text) else scene.checkerboard(*parse_board(text))
+    return read_target(text, "board", "--board") if is_described(text) else scene.checkerboard(*parse_board(text))
 
 
 def spelled_target(text: str, where: str) -> scene.Target | None:
@@ -58,9 +58,9 @@ def require_file_of_targets(text: str, names: Iterable[str]) -> Path:
     raise InputError(f"{no_such('target', text, names)} (or a board such as 9x6x25mm, or a file)")
 
 
-def read_target(text: str, name: str) -> scene.Target:
+def read_target(text: str, name: str, where: str = "--target") -> scene.Target:
     """Return the target of `--target`: by name, spelled out, or from a file, alone or by this name among several."""
-    if (spelled := spelled_target(text, "--target")) is not None:
+    if (spelled := spelled_target(text, where)) is not None:
         return spelled
     if (known := scene.target_named(text)) is not None:
         return known
