@@ -64,7 +64,7 @@ def test_a_mirrored_picture_is_refused(name: str, how: str) -> None:
     seen = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
     text = refusal(with_pixels(seen, MIRRORED[how]))
     assert re.search(r"the camera stands 5\.(19|2\d*) m under the floor that it sees: ", text) and ANY in text
-    assert text.endswith("or left and right are exchanged in the labels: correct the observations")
+    assert text.endswith("or left and right, or top and bottom, are exchanged in the labels: correct the observations")
     assert "\n" not in text
 
 

@@ -54,6 +54,18 @@ def test_exchanged_names_are_refused_and_corrected(curve: str, instead: str) -> 
     assert np.array_equal(found.corrected(wrong).curves.feature, right.curves.feature)
 
 
+def test_two_of_four_curves_are_found_by_a_search() -> None:
+    """No closed form suits three lines and a circle; they were refused for another reason after 14 s."""
+    right = left_part()
+    shown = [FIELD.curve_index[name] for name in ("BottomTouchLine", "HalfwayLine", "CenterLine", "CenterCircle")]
+    four = right.part(np.zeros(0, dtype=bool), np.isin(right.curves.feature, shown))
+    found = find_renaming(
+        renamed(four, {"BottomTouchLine": "HalfwayLine", "HalfwayLine": "BottomTouchLine"}), Options()
+    )
+    assert found is not None and {found.curve, found.instead} == {"BottomTouchLine", "HalfwayLine"}
+    assert find_renaming(four, Options()) is None
+
+
 def test_a_line_under_the_name_of_one_that_is_not_seen() -> None:
     right = left_part()
     wrong = renamed(right, {"HalfwayLine": "RightPenaltyStretch"})

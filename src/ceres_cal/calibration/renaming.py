@@ -8,7 +8,7 @@ that one takes the first one's name.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from ceres_cal.robust.usable import NO_FIT
 from ceres_cal.start.initialise import Start, initialise
 
 _MOST_CURVES = 12  # of a station: of more, two are outvoted
+_MOST_SEARCHED = 10  # exchanges among five curves: a search for the camera takes half a second
 # Share of the observations that must fit; ratio of what they are off by to that of the next best. With two names
 # exchanged among 4 to 13 curves, the ratio was 17 and more where the camera was lost.
 _FITTING, _BETTER = 0.9, 10.0
@@ -87,12 +88,27 @@ def find_renaming(observations: Observations, options: Options) -> Renaming | No
         own = _of_world(observations.of_station(station))
         if len(own.points) or not len(own.curves):
             continue
+        as_named = _off_by(own, named, may_search=True)
+        if as_named <= NO_FIT * np.hypot(*observations.cameras[observations.stations[station]]):
+            continue
         tried = [*_candidates(own, station)]
-        each = np.array([np.inf, np.inf, *(_off_by(one.corrected(own), named) for one in tried)])
-        least, second = np.argsort(each)[:2]
-        if _BETTER * each[least] < min(each[second], _off_by(own, named, may_search=True)):
-            return tried[int(least) - 2]
+        exchanges = [one for one in tried if one.are_exchanged]
+        found = _only(own, tried, named, as_named)
+        if found is None and len(exchanges) <= _MOST_SEARCHED:
+            found = _only(own, exchanges, named, as_named, may_search=True)
+        if found:
+            return found
     return None
+
+
+def _only(
+    observations: Observations, tried: Sequence[Renaming], options: Options, most: float, *, may_search: bool = False
+) -> Renaming | None:
+    """Return the only one of some changes by which all fits together."""
+    off = [_off_by(one.corrected(observations), options, may_search=may_search) for one in tried]
+    least, *others = np.argsort(off) if off else (0,)
+    second = min([most, *(off[number] for number in others[:1])])
+    return tried[int(least)] if off and _BETTER * off[least] < second else None
 
 
 def _of_world(observations: Observations) -> Observations:

@@ -73,7 +73,8 @@ def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -
         if floor_m is not None and camera.position[2] <= min(floor_m, 0.0):
             raise SolutionError(
                 f"station {station!r}: the camera stands {floor_m - camera.position[2]:.2f} m under the floor that it "
-                f"sees: {_cause(camera)}, or left and right are exchanged in the labels: correct the observations"
+                f"sees: {_cause(camera)}, or left and right, or top and bottom, are exchanged in the labels: correct "
+                "the observations"
             )
         _require_ahead(station, sight, residuals)
         if floor_m is not None:

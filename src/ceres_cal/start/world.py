@@ -113,7 +113,8 @@ def placed(
         if holds(mirrored, other) and other.costs[0] + _ALIKE < found.costs[0]:
             raise InputError(
                 f"station {sight.keys[0].station!r}: its picture of the floor is mirrored: x and y are "
-                "swapped, or y points upwards, or left and right are exchanged in the labels: correct the observations"
+                "swapped, or y points upwards, or left and right, or top and bottom, are exchanged in the labels: "
+                "correct the observations"
             )
     return _answered(*_at_rest(sight, lines, chosen, found))
 
