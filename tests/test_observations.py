@@ -404,7 +404,7 @@ BAD_DOCUMENTS: list[tuple[Callable[[Document], object], tuple[str, ...]]] = [
         at("priors", 0, value={"station": "overhead", "phi": 4.0, "sigma_m": 1.0}),
         ("prior 0: a station's prior is on height_m or position_m, not 'phi'",),
     ),
-    (at("priors", 0, "height_m", value="4"), ("prior 0: height_m: Expected a list, got a text",)),
+    (at("priors", 0, "height_m", value="4"), ("prior 0: height_m must be a number, such as 4.6, not '4'",)),
     (
         at("priors", 0, "height_m", value=np.nan),
         ("prior on 'height_m' of 'overhead': finite numbers and a sigma above 0",),

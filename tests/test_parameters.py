@@ -249,5 +249,15 @@ def test_numbers_of_numpy_are_numbers() -> None:
     assert (options.powers, options.fixed) == ((2, 3), {"phi": 800.0}) and type(options.powers[0]) is int
     prior = Prior("station", "s", "height_m", np.array([4.0]), [np.int64(1)])  # type: ignore[arg-type]
     assert (prior.value, prior.sigma) == ((4.0,), (1.0,))
-    with pytest.raises(InputError, match=r"Prior\(value=\.\.\.\): Expected a list, got a text"):
+    with pytest.raises(InputError, match=r"Prior\(value=\.\.\.\): Expected a number, got a text"):
         Prior("station", "s", "height_m", "x", (1.0,))  # type: ignore[arg-type]
+
+
+def test_a_prior_of_one_number_takes_a_number() -> None:
+    """As files do. It was "Expected a list, got a number"."""
+    height = Prior("station", "s", "height_m", 4.6, 0.01)  # type: ignore[arg-type]
+    assert height == Prior("station", "s", "height_m", (4.6,), (0.01,))
+    position = Prior("station", "s", "position_m", (1.0, 2.0, 4.6), 0.01)  # type: ignore[arg-type]
+    assert position.sigma == (0.01, 0.01, 0.01)
+    with pytest.raises(InputError, match="give 3 numbers and 3 sigmas"):
+        Prior("station", "s", "position_m", 4.6, 0.01)  # type: ignore[arg-type]

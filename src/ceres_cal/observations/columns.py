@@ -48,11 +48,15 @@ class Prior(Frozen, eq=True):
     name: str
     quantity: str
     value: tuple[float, ...]
+    """A number alone is taken as well; as a sigma, for each number of the value."""
     sigma: tuple[float, ...]
     gives_way: bool = False
     """Whether it counts less the farther off it is; no prior in a file does."""
 
     def __post_init__(self) -> None:
+        held, several = vars(self), (tuple, list, np.ndarray)
+        held["value"] = self.value if isinstance(self.value, several) else (self.value,)
+        held["sigma"] = self.sigma if isinstance(self.sigma, several) else (self.sigma,) * len(self.value)
         take_types(self)
         here = f"prior on {self.quantity!r} of {self.name!r}"
         if self.owner not in PRIOR_OWNERS:
@@ -295,6 +299,9 @@ def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
 def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tuple[float, ...]:
     if isinstance(value, (int, float)) and (size == 1 or spread):
         return (float(value),) * size
+    if not isinstance(value, list):
+        needed = "a number, such as 4.6" if size == 1 else f"a list of {size} numbers"
+        raise InputError(f"{where} must be {needed}, not {value!r}")
     numbers = convert(value, list[float], where)
     if len(numbers) != size:
         raise InputError(f"{where}: {size} numbers are needed, not {len(numbers)}")
