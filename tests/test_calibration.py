@@ -170,7 +170,7 @@ def test_stations_by_name() -> None:
     assert one.station() == one.station("overhead") == one.stations["overhead"]
     assert one.station().cam_from_world == one.estimate.stations["overhead"].cam_from_world
     assert list(three.stations) == ["first", "second", "third"] and list(three.cameras) == ["overhead"]
-    with pytest.raises(InputError, match=r"which station\? Name one of first, second, third"):
+    with pytest.raises(InputError, match=r"which station\? Name one of first, second, third \(--station NAME\)"):
         three.station()
     with pytest.raises(InputError, match=r"there is no station .frist.: did you mean .first."):
         three.station("frist")

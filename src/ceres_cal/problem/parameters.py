@@ -287,7 +287,7 @@ class Estimate(Frozen, eq=True):
         if name is None and len(self.stations) == 1:
             return next(iter(self.stations))
         if name is None:
-            raise InputError(f"which station? Name one of {', '.join(self.stations)}")
+            raise InputError(f"which station? Name one of {', '.join(self.stations)} (--station NAME)")
         if name not in self.stations:
             raise InputError(no_such("station", name, self.stations))
         return name
