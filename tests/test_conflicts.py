@@ -239,6 +239,14 @@ def test_what_is_held_is_known_beside_everything_else() -> None:
     assert known.posterior.sd_of("station", "overhead", "height") > 0.003
 
 
+def test_what_is_stated_is_known_beside_lenses_with_another_phi() -> None:
+    """With phi to 1 px, which is 5 mm of the height, other lenses left the height open by 13 mm."""
+    stated = Options(priors=(Prior("camera", "overhead", "phi", (868.0,), (1.0,)),))
+    known = calibrate(seen(), stated).uncertainty.posterior
+    assert known.sd_of("camera", "overhead", "phi") <= 1.0
+    assert 0.005 < known.sd_of("station", "overhead", "height") < 0.01  # 0.0078 measured
+
+
 def test_a_fisheye_without_a_wrong_height_is_found_where_it_was_before() -> None:
     """From the estimate with a height of 2.4 m, the observations alone gave 2.16 m, phi 367 px, and errors of 80 mm."""
     pose = overhead_pose(0.1, -0.2, 3.2, tilt_x_deg=9.0, tilt_y_deg=-4.3, yaw_deg=3.0)

@@ -269,20 +269,24 @@ class Posterior(Frozen):
 
     def _off(self, lens: int, keys: Sequence[Key]) -> Array:
         """(K,) phi, stations' poses and coefficients with a lens, relative to the chosen one; NaN for all else: for
-        coefficients that this lens lacks, or of another kind; for numbers that are followed; and beside boards that
-        several cameras see, because each lens was solved for without the other cameras. Phi is the focal length on the
-        axis with every kind of lens.
+        coefficients that this lens lacks, or of another kind; for numbers that are followed; for poses where phi is
+        held, because lenses were compared with it free; and beside boards that several cameras see, because each lens
+        was solved for without the other cameras. Phi is the focal length on the axis with every kind of lens.
         """
         chosen, other, off = self.lenses[0], self.lenses[lens], np.full(len(keys), np.nan)
         if any(key.kind == "placement" for key in self.keys):
             return off
         alike = {name for name, one in other.cameras.items() if one.lens.kind == chosen.cameras[name].lens.kind}
-        owners = {("station", name) for name in other.stations}
         own = {("camera", name, "phi") for name in other.cameras}
         own |= {("camera", name, coefficient) for name in alike for coefficient in other.cameras[name].lens.names}
         own -= {key[:3] for key in self.followed_phi}
-        at = [i for i, key in enumerate(keys) if key[:2] in owners or key[:3] in own]
-        off[at] = difference(other, chosen, [keys[i] for i in at])
+        for phi, stated in zip(self.keys, self.stated_sd.tolist(), strict=True):
+            if phi.kind == "camera" and phi.quantity == "phi":
+                owners = {("station", name) for name, one in other.stations.items() if one.camera == phi.owner}
+                at = [i for i, key in enumerate(keys) if key[:2] in owners or (key[:2] == phi[:2] and key[:3] in own)]
+                away = abs(other.cameras[phi.owner].phi - chosen.cameras[phi.owner].phi)
+                share = min(1.0, stated / away) if away else 1.0  # its phi is no farther away than was stated
+                off[at] = share * difference(other, chosen, [keys[i] for i in at])
         return off
 
     @cached_property
