@@ -66,7 +66,7 @@ def watched(*views: tuple[str, str | None], cameras: dict[str, str] | None = Non
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"lens": "glass"}, "there is no lens 'glass': choose one of radial, brown, kannala-brandt"),
+        ({"lens": "glass"}, "there is no lens 'glass': choose one of auto, radial, brown, kannala-brandt"),
         ({"lens": "fisheye"}, "there is no lens 'fisheye': here it is 'kannala-brandt'"),
         ({"loss": "l2"}, "there is no loss 'l2': choose one of trivial, huber, soft_l1, cauchy, tukey"),
         ({"noise_scale": "guess"}, "noise_scale must be 'estimate' or 'stated', not 'guess'"),

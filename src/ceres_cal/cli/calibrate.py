@@ -28,7 +28,7 @@ def _lens_kind(name: str) -> str:
     """Check a kind of lens against the table, which is not imported for the default, for help or for wrong usage."""
     if name != _AUTO:
         with naming("--lens"):
-            scene.make_lens(name)
+            scene.lens_class(name, also=(_AUTO,))
     return name
 
 

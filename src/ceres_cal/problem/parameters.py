@@ -106,7 +106,7 @@ class Options(Frozen, eq=True):
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
-            lens_class(self.lens)
+            lens_class(self.lens, also=(AUTO,))
             left_open = () if lens_class(self.lens).set_at_start else PAPERS_POWERS
             object.__setattr__(self, "powers", tuple(self.powers) or left_open)
         elif self.terms:

@@ -24,6 +24,7 @@ from ceres_cal.scene.foreign import opencv_models as opencv_models
 from ceres_cal.scene.lens import LENSES as LENSES
 from ceres_cal.scene.lens import Lens as Lens
 from ceres_cal.scene.lens import Radial as Radial
+from ceres_cal.scene.lens import lens_class as lens_class
 from ceres_cal.scene.lens import make_lens as make_lens
 from ceres_cal.scene.symmetry import TURNED as TURNED
 from ceres_cal.scene.symmetry import counterparts as counterparts

@@ -337,8 +337,11 @@ def register(lens: type[_L]) -> type[_L]:
     return lens
 
 
-def lens_class(kind: str) -> type[Lens]:
+def lens_class(kind: str, also: Sequence[str] = ()) -> type[Lens]:
     """Return the lens model with a name.
+
+    Args:
+        also: other words that may stand there.
 
     Raises:
         InputError: there is none; the message says which lens has this name in other programs.
@@ -347,7 +350,7 @@ def lens_class(kind: str) -> type[Lens]:
         common = str(kind).lower().replace("_", "-")
         here = [one for one, lens in LENSES.items() if common in lens.also_called]
         raise InputError(
-            f"there is no lens {kind!r}: here it is {here[0]!r}" if here else no_such("lens", kind, LENSES)
+            f"there is no lens {kind!r}: here it is {here[0]!r}" if here else no_such("lens", kind, (*also, *LENSES))
         )
     return LENSES[kind]
 
