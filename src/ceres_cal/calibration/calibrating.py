@@ -13,7 +13,6 @@ from ceres_cal.base import at_most, checked, counted, for_small_matrices, meanwh
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, SolutionError, attempt, or_none
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.outcome import of_closed_form
-from ceres_cal.calibration.renaming import started
 from ceres_cal.calibration.solving import Task, TaskSolution, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import odd_sizes, require_filled, unfilled
@@ -28,9 +27,11 @@ from ceres_cal.problem import (
 )
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import freed, loosely
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import Construction, free_dimensions
 from ceres_cal.robust.camera_noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
+from ceres_cal.robust.usable import NO_FIT
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.start.listed import require_as_listed
@@ -241,13 +242,13 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
     sights, free = gather_sights(observations), freed(observations, options)
 
     def as_asked() -> Calibration:
-        return _of_lens_asked(task, started(sights, _named(options)), sights, options)
+        return _of_lens_asked(task, _started(sights, _named(options)), sights, options)
 
     little, loose = loosely(observations, free)
     if not options.closed_form_only and (little, loose) != (observations, options):
         asked = replace(task, stated=(observations, options))
         # quiet: without the statements the observations are too few, here and after the start
-        start = attempt(partial(started, sights, _named(free)))
+        start = attempt(partial(_started, sights, _named(free)))
         if isinstance(start, Start):
             little_said = replace(sights, observations=little)
             found = attempt(partial(_of_lens_asked, asked, start, little_said, loose))  # quiet: as for the start
@@ -258,6 +259,27 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
         elif free is options or isinstance(start, InputError):
             raise start  # there is no other start
     return as_asked()
+
+
+def _started(sights: Sights, options: Options) -> Start:
+    """Find an initial estimate.
+
+    Raises:
+        InputError: many curves are far from it, and one of them has the name of another.
+        DegenerateError: see `initialise`.
+    """
+    usually = 0.9  # share of a camera's curves that lie near a start: with two exchanged names it was below 0.84
+    start = initialise(sights, options)
+    lengths = residuals(sights, start.estimate).lengths[1]
+    for name, camera in start.estimate.cameras.items():
+        own = lengths[sights.of_camera(name).curve_rows]
+        near = np.count_nonzero(own <= NO_FIT * np.hypot(*camera.image_size))  # NaN is not
+        if near < usually * len(own):
+            from ceres_cal.calibration.renaming import find_renaming
+
+            if found := find_renaming(sights.observations.of_camera(name), options):
+                raise InputError(f"{found.words}: correct them, or let `ceres-cal calibrate --mend-labels` do so")
+    return start
 
 
 def _or_as_asked(

@@ -12,14 +12,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base import CalibrationError, Frozen, InputError, attempt, distinct, replace
+from ceres_cal.base import CalibrationError, Frozen, attempt, distinct, replace
 from ceres_cal.calibration.lens_forms import papers
-from ceres_cal.observations import Observations, Sights, gather_sights
+from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem import Options, problem_of
-from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.robust.usable import NO_FIT
-from ceres_cal.start.initialise import Start, initialise
+from ceres_cal.start.initialise import initialise
 
 _MOST_CURVES = 12  # of a station: of more, two are outvoted
 _MOST_SEARCHED = 10  # exchanges among five curves: a search for the camera takes half a second
@@ -58,25 +57,6 @@ class Renaming(Frozen, eq=True):
         feature = np.where(seen & (curves.feature == one), other, curves.feature)
         feature[seen & (curves.feature == other)] = one
         return replace(observations, curves=replace(curves, feature=feature))
-
-
-def started(sights: Sights, options: Options) -> Start:
-    """Find an initial estimate.
-
-    Raises:
-        InputError: many curves are far from it, and `find_renaming` finds a wrong name.
-        DegenerateError: see `initialise`.
-    """
-    start = initialise(sights, options)
-    lengths = residuals(sights, start.estimate).lengths[1]
-    for name, camera in start.estimate.cameras.items():
-        own = lengths[sights.of_camera(name).curve_rows]
-        fitting = np.count_nonzero(own <= NO_FIT * np.hypot(*camera.image_size))  # NaN does not
-        if fitting < _FITTING * len(own):
-            found = find_renaming(sights.observations.of_camera(name), options)
-            if found:
-                raise InputError(f"{found.words}: correct them, or let `ceres-cal calibrate --mend-labels` do so")
-    return start
 
 
 def find_renaming(observations: Observations, options: Options) -> Renaming | None:
