@@ -627,7 +627,9 @@ def test_observations_that_cannot_tell(observations: Callable[[], Observations],
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("most, height_m, tilt", [(8, 5.3, 0.31), (24, 4.5, 0.1)])
+@pytest.mark.parametrize(
+    "most, height_m, tilt", [(8, 5.3, 0.31), pytest.param(24, 4.5, 0.1, marks=pytest.mark.thorough)]
+)
 def test_a_height_in_metres_over_a_target_in_millimetres(most: int, height_m: float, tilt: float) -> None:
     """Almost no observation agrees with both; there were a traceback of NumPy and a mixture with a
     million components.

@@ -271,7 +271,8 @@ class Posterior(Frozen):
         """(K,) phi, stations' poses and coefficients with a lens, relative to the chosen one; NaN for all else: for
         coefficients that this lens lacks, or of another kind; for numbers that are followed; for poses where phi is
         held, because lenses were compared with it free; and beside boards that several cameras see, because each lens
-        was solved for without the other cameras. Phi is the focal length on the axis with every kind of lens.
+        was solved for without the other cameras. Phi is the focal length on the axis with every kind of lens, but one
+        without a formula does not tell it: it was 953 px beside 685 and 720 with two formulas.
         """
         chosen, other, off = self.lenses[0], self.lenses[lens], np.full(len(keys), np.nan)
         if any(key.kind == "placement" for key in self.keys):
@@ -281,7 +282,7 @@ class Posterior(Frozen):
         own |= {("camera", name, coefficient) for name in alike for coefficient in other.cameras[name].lens.names}
         own -= {key[:3] for key in self.followed_phi}
         for phi, stated in zip(self.keys, self.stated_sd.tolist(), strict=True):
-            if phi.kind == "camera" and phi.quantity == "phi":
+            if phi.quantity == "phi" and (phi.owner in alike or not other.cameras[phi.owner].lens.roughness):
                 owners = {("station", name) for name, one in other.stations.items() if one.camera == phi.owner}
                 at = [i for i, key in enumerate(keys) if key[:2] in owners or (key[:2] == phi[:2] and key[:3] in own)]
                 away = abs(other.cameras[phi.owner].phi - chosen.cameras[phi.owner].phi)
