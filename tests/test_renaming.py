@@ -1,10 +1,13 @@
 """Lines of the world under wrong names, where no other observations outvote them."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scenery import field_scene, overhead_pose
+from test_cli import Say, say
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration.calibrating import calibrate
@@ -15,6 +18,8 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Station, simulate
+
+__all__ = ["say"]
 
 CAMERA = Camera((1280, 960), 900.0, (639.5, 479.5), Radial((-5e-5, 6e-7)))
 FIELD = ssl_field("B")
@@ -52,6 +57,15 @@ def test_exchanged_names_are_refused_and_corrected(curve: str, instead: str) -> 
     found = find_renaming(wrong, Options())
     assert found is not None and {found.curve, found.instead} == {curve, instead} and found.are_exchanged
     assert np.array_equal(found.corrected(wrong).curves.feature, right.curves.feature)
+
+
+def test_the_command_corrects_them(say: Say, tmp_path: Path) -> None:
+    renamed(left_part(), {"HalfwayLine": "LeftGoalLine", "LeftGoalLine": "HalfwayLine"}).save(tmp_path / "wrong.json")
+    refused = say("calibrate", tmp_path / "wrong.json")
+    assert refused.code == 2 and "exchange their names" in refused.err
+    said = json.loads(say("calibrate", tmp_path / "wrong.json", "--mend-labels", "--json").out)["calibration"]
+    assert any(one.endswith("exchange their names: renamed") for one in said["remarks"])
+    assert not [one for one in said["rejected"] if one["kind"] == "curve" and one["feature"] == "HalfwayLine"][3:]
 
 
 def test_two_of_four_curves_are_found_by_a_search() -> None:
