@@ -56,7 +56,7 @@ class Renaming(Frozen, eq=True):
         seen, (one, other) = np.array(own)[curves.view], (names.index(self.curve), names.index(self.instead))
         feature = np.where(seen & (curves.feature == one), other, curves.feature)
         feature[seen & (curves.feature == other)] = one
-        return replace(observations, curves=replace(curves, feature=feature))
+        return observations.with_features(observations.points.feature, feature)
 
 
 def find_renaming(observations: Observations, options: Options) -> Renaming | None:

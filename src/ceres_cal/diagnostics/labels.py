@@ -236,8 +236,4 @@ def mended(observations: Observations, wrong: Iterable[WrongLabel]) -> Observati
     points, curves = observations.points.feature.copy(), observations.curves.feature.copy()
     for one in wrong:
         (curves if one.is_curve else points)[one.rows] = one.instead
-    return replace(
-        observations,
-        points=replace(observations.points, feature=points),
-        curves=replace(observations.curves, feature=curves),
-    )
+    return observations.with_features(points, curves)

@@ -246,6 +246,10 @@ class Observations(Content):
             vars(part)["copies"] = Copies(self.copies.points[points], self.copies.curves[curves])
         return part
 
+    def with_features(self, points: Indices32, curves: Indices32) -> Observations:
+        """Return the same pixels under other names: (N,) and (M,) numbers of features."""
+        return replace(self, points=replace(self.points, feature=points), curves=replace(self.curves, feature=curves))
+
     def with_targets(self, targets: Mapping[str, Target]) -> Observations:
         """Return the same observations of targets with another drawing; the digest is kept."""
         each = [(target, targets[name]) for name, target in self.targets.items()]

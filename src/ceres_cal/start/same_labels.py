@@ -12,7 +12,7 @@ from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import CalibrationError, Frozen, Pose, attempt, median, replace, rotation_exp
+from ceres_cal.base import CalibrationError, Frozen, Pose, attempt, median, rotation_exp
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import Target
@@ -169,4 +169,4 @@ def _relabelled(observations: Observations, station: str, placement: str, turn: 
             rows = np.flatnonzero(points.view == number)
             sought = turn.inverse.transform(places[points.feature[rows]])
             feature[rows] = np.argmin(np.linalg.norm(sought[:, None] - places, axis=2), axis=1)
-    return replace(observations, points=replace(points, feature=feature))
+    return observations.with_features(feature, observations.curves.feature)
