@@ -134,7 +134,7 @@ def files_of_a_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     from accuracy.moves import DAY, HOME, MOVED, calibrated, seen
 
-    from ceres_cal.moves.refit_plan import relabelled
+    from ceres_cal.calibration.renaming import relabelled
     from ceres_cal.scene.symmetry import MIRRORED
 
     folder = tmp_path_factory.mktemp("move")

@@ -16,9 +16,9 @@ from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.cli.moves import _checked_station
 from ceres_cal.moves.checks import check
-from ceres_cal.moves.refit_plan import relabelled
 from ceres_cal.moves.refits import movements, refit
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import taken

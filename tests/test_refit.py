@@ -37,9 +37,10 @@ from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.file import PriorFile
+from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.diagnostics.diagnosis import diagnose
 from ceres_cal.moves.poses import movement
-from ceres_cal.moves.refit_plan import RefitOptions, carried_prior, make_plan, relabelled
+from ceres_cal.moves.refit_plan import RefitOptions, carried_prior, make_plan
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.posterior.maps import visible_pixels

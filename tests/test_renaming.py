@@ -9,13 +9,14 @@ import pytest
 from scenery import field_scene, overhead_pose
 from test_cli import Say, say
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import Array, InputError
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.calibration.renaming import find_renaming
+from ceres_cal.calibration.renaming import find_renaming, opposite_names, relabelled
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import MIRRORED, TURNED
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Station, simulate
 
@@ -94,3 +95,23 @@ def test_right_names_are_taken(seed: int) -> None:
     right = left_part(seed)
     assert find_renaming(right, Options()) is None
     assert np.hypot(*(calibrate(right).station("c").position[:2] - (-2.0, -0.6))) < 0.05  # 0.007 to 0.02 measured
+
+
+@pytest.mark.parametrize(
+    ("named", "image", "words"),
+    [
+        ("points", TURNED, "turned by half a turn"),
+        ("curves", TURNED, "turned by half a turn"),
+        ("curves", MIRRORED, "mirrored in x"),
+    ],
+)
+def test_points_and_curves_named_from_different_sides(named: str, image: Array, words: str) -> None:
+    """It was refused after 9 to 14 s: "misses half of its observations", or "cannot project an observation"."""
+    station = Station("c", overhead_pose(-2.0, -0.6, 4.2, 9.0, -6.0, 4.0))
+    right = simulate(field_scene(FIELD, {"c": CAMERA}, {"c": station}, spacing_m=0.25), Disturbance(), 1).observations
+    other = relabelled(right, image)
+    assert other is not None
+    wrong = replace(right, points=other.points) if named == "points" else replace(right, curves=other.curves)
+    with pytest.raises(InputError, match=f"named from different sides: all fits together if .* are {words}: correct"):
+        calibrate(wrong)
+    assert opposite_names(right, Options()) is None

@@ -12,8 +12,8 @@ from scenery import field_scene, overhead_pose
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.checks import check
-from ceres_cal.moves.refit_plan import relabelled
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
 from ceres_cal.problem.parameters import Options

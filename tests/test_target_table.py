@@ -13,10 +13,11 @@ from scenes import camera
 
 from ceres_cal import Calibration, InputError, Observations, Options, calibrate, painted_field, write_report
 from ceres_cal.base.files import convert
+from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.diagnostics.advice import advise
-from ceres_cal.moves.refit_plan import mistaken_targets, relabelled
+from ceres_cal.moves.refit_plan import mistaken_targets
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.report.pictures.frames import frame_by_name
 from ceres_cal.scene.curves import Arc, Curve, Segment

@@ -1,25 +1,29 @@
-"""Find the one curve of the world whose name is wrong, where observations fit together in no other way.
+"""Find wrong names of the world's features, where observations fit together in no other way.
 
-Among many curves a wrong name is outvoted, and its observations are taken out. Among few it is not: two lines of six
-under each other's names left a camera 1 m above the field, and its right height was contradicted. But a closed form
-tells at once whether all curves suit a camera, so each is tried under each other name; a curve that is observed under
-that one takes the first one's name.
+Points and curves may be named from different sides of the world. Or one curve has a wrong name: among many curves it is
+outvoted, and its observations are taken out. Among few it is not: two lines of six under each other's names left a
+camera 1 m above the field, and its right height was contradicted. But a closed form tells at once whether all curves
+suit a camera, so each is tried under each other name; a curve that is observed under that one takes the first one's
+name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
+from typing import TypeVar
 
 import numpy as np
 
-from ceres_cal.base import CalibrationError, Frozen, attempt, distinct, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, attempt, distinct, replace
 from ceres_cal.calibration.lens_forms import papers
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem import Options, problem_of
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.robust.usable import NO_FIT
+from ceres_cal.scene.symmetry import MIRRORED, TURNED, counterparts
 from ceres_cal.start.initialise import initialise
 
+_One = TypeVar("_One")
 _MOST_CURVES = 12  # of a station: of more, two are outvoted
 _MOST_SEARCHED = 10  # exchanges among five curves: a search for the camera takes half a second
 # Share of the observations that must fit; ratio of what they are off by to that of the next best. With two names
@@ -59,36 +63,84 @@ class Renaming(Frozen, eq=True):
         return observations.with_features(observations.points.feature, feature)
 
 
+def relabelled(observations: Observations, image: Array) -> Observations | None:
+    """Return the observations of the world with each feature replaced by the one at x, y, z times `image`; None where
+    an observed feature has no such counterpart.
+    """
+    points, curves = observations.points, observations.curves
+    p, c, side = points.feature.copy(), curves.feature.copy(), curves.side.copy()
+    shown = [view.target if view.placement is None else "" for view in observations.views]
+    for name in {*shown} - {""}:
+        to_point, to_curve, flips = counterparts(observations.targets[name], image)
+        of_it = np.array([one == name for one in shown])
+        own, along = of_it[points.view], of_it[curves.view]
+        p[own], c[along] = to_point[p[own]], to_curve[c[along]]
+        side[along] *= flips[curves.feature[along]]
+    if np.any(p < 0) or np.any(c < 0):
+        return None
+    return replace(observations, points=replace(points, feature=p), curves=replace(curves, feature=c, side=side))
+
+
 def find_renaming(observations: Observations, options: Options) -> Renaming | None:
     """Return the only change of one name with which all curves fit together that some station shows of the world.
     Points beside them decide by themselves.
     """
-    named = replace(papers(options), priors=())
-    for station in observations.stations:
-        own = _of_world(observations.of_station(station))
-        if len(own.points) or not len(own.curves):
-            continue
-        as_named = _off_by(own, named, may_search=True)
-        if as_named <= NO_FIT * np.hypot(*observations.cameras[observations.stations[station]]):
-            continue
-        tried = [*_candidates(own, station)]
-        exchanges = [one for one in tried if one.are_exchanged]
-        found = _only(own, tried, named, as_named)
+    named = _papers(options)
+    for station, own, as_named in _misfits(observations, named, have_points=False):
+        tried = {one: one.corrected(own) for one in _candidates(own, station)}
+        exchanges = {one: seen for one, seen in tried.items() if one.are_exchanged}
+        found = _only(tried, named, as_named)
         if found is None and len(exchanges) <= _MOST_SEARCHED:
-            found = _only(own, exchanges, named, as_named, may_search=True)
+            found = _only(exchanges, named, as_named, may_search=True)
         if found:
             return found
     return None
 
 
+def opposite_names(observations: Observations, options: Options) -> str | None:
+    """Return in words which station's curves are named from another side of the world than its points, so that all fits
+    together if the names of one of the two are turned or mirrored; None where there is none.
+    """
+    named = _papers(options)
+    images = {"turned by half a turn": TURNED, "mirrored in x": MIRRORED, "mirrored in y": TURNED * MIRRORED}
+    for station, own, as_named in _misfits(observations, named, have_points=True):
+        curves = own.part(np.zeros(0, dtype=np.intp), np.arange(len(own.curves)))
+        other = {words: relabelled(curves, image) for words, image in images.items()}
+        tried = {words: replace(own, curves=one.curves) for words, one in other.items() if one}
+        if found := _only(tried, named, as_named):
+            return (
+                f"station {station!r}: its points and its curves are named from different sides: all fits together if "
+                f"the names of the curves, or those of the points, are {found}"
+            )
+    return None
+
+
+def _papers(options: Options) -> Options:
+    return replace(papers(options), priors=())
+
+
+def _misfits(
+    observations: Observations, options: Options, *, have_points: bool
+) -> Iterator[tuple[str, Observations, float]]:
+    """Yield each station with curves, and with or without points, whose curves no camera suits; with what it shows of
+    the world, and how far (px) that is off.
+    """
+    for station in observations.stations:
+        own = _of_world(observations.of_station(station))
+        if len(own.curves) and bool(len(own.points)) == have_points:
+            off = _off_by(own, options, may_search=not have_points)
+            if off > NO_FIT * np.hypot(*observations.cameras[observations.stations[station]]):
+                yield station, own, off
+
+
 def _only(
-    observations: Observations, tried: Sequence[Renaming], options: Options, most: float, *, may_search: bool = False
-) -> Renaming | None:
+    tried: Mapping[_One, Observations], options: Options, most: float, *, may_search: bool = False
+) -> _One | None:
     """Return the only one of some changes by which all fits together."""
-    off = [_off_by(one.corrected(observations), options, may_search=may_search) for one in tried]
+    off = [_off_by(one, options, may_search=may_search) for one in tried.values()]
     least, *others = np.argsort(off) if off else (0,)
     second = min([most, *(off[number] for number in others[:1])])
-    return tried[int(least)] if off and _BETTER * off[least] < second else None
+    return [*tried][int(least)] if off and _BETTER * off[least] < second else None
 
 
 def _of_world(observations: Observations) -> Observations:
@@ -107,14 +159,15 @@ def _candidates(observations: Observations, station: str) -> Iterator[Renaming]:
 
 
 def _off_by(observations: Observations, options: Options, *, may_search: bool = False) -> float:
-    """Return how far (px) all but a few observations are off; infinite where no camera suits them."""
+    """Return how far (px) all but a few points and curves are off; infinite where no camera suits them."""
     sights = gather_sights(observations)
 
     def off_by() -> float:
         start = initialise(sights, options, may_search=may_search)
         end = solve_robustly(problem_of(sights, options, start.estimate), start.estimate, most_rounds=2)
-        lengths = np.sort(np.concatenate(end.residuals.lengths))  # NaN comes last
-        return float(np.nan_to_num(lengths[int(_FITTING * (len(lengths) - 1))], nan=np.inf))
+        kinds = (np.sort(lengths) for lengths in end.residuals.lengths if len(lengths))  # NaN comes last
+        off = [lengths[int(_FITTING * (len(lengths) - 1))] for lengths in kinds]
+        return float(np.max(np.nan_to_num(off, nan=np.inf)))
 
     found = attempt(off_by)  # quiet: where there is no camera, nothing is explained
     return np.inf if isinstance(found, CalibrationError) else found

@@ -14,9 +14,10 @@ import numpy as np
 from ceres_cal.base import CalibrationError, Frozen, Pose, SolutionError, attempt, replace, upper_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.agreement import NOISIER, price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
-from ceres_cal.moves.refit_plan import RefitPlan, mistaken_targets, relabelled
+from ceres_cal.moves.refit_plan import RefitPlan, mistaken_targets
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.posterior import LEAST_PROBABILITY
 from ceres_cal.problem import make_structure

@@ -1,6 +1,6 @@
 """The use of an old calibration for the next one: its estimate is the start, its posterior a prior.
 
-Also the same observations under other names: of a field turned by half a turn, mirrored, or of other dimensions.
+Also the same observations of a target of other dimensions.
 """
 
 from __future__ import annotations
@@ -9,34 +9,17 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Pose, no_such, replace
+from ceres_cal.base import Frozen, InputError, Pose, no_such, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibration import loosened, still_known
+from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.agreement import matched, require_posterior
 from ceres_cal.observations import Observations, Prior, Sights, gather_sights
 from ceres_cal.problem import GaussianPrior, Problem, gather_priors, require_possible_numbers
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
 from ceres_cal.problem.quantities import natural_sizes
-from ceres_cal.scene import TURNED, Target, counterparts, target_from_spec
-
-
-def relabelled(observations: Observations, image: Array) -> Observations | None:
-    """Return the observations of the world with each feature replaced by the one at x, y, z times `image`; None where
-    an observed feature has no such counterpart.
-    """
-    points, curves = observations.points, observations.curves
-    p, c, side = points.feature.copy(), curves.feature.copy(), curves.side.copy()
-    shown = [view.target if view.placement is None else "" for view in observations.views]
-    for name in {*shown} - {""}:
-        to_point, to_curve, flips = counterparts(observations.targets[name], image)
-        of_it = np.array([one == name for one in shown])
-        own, along = of_it[points.view], of_it[curves.view]
-        p[own], c[along] = to_point[p[own]], to_curve[c[along]]
-        side[along] *= flips[curves.feature[along]]
-    if np.any(p < 0) or np.any(c < 0):
-        return None
-    return replace(observations, points=replace(points, feature=p), curves=replace(curves, feature=c, side=side))
+from ceres_cal.scene import TURNED, Target, target_from_spec
 
 
 def mistaken_targets(observations: Observations) -> dict[str, Observations]:
