@@ -25,7 +25,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
-from ceres_cal.robust.camera_noise import _scale_of_few, noise_of_cameras
+from ceres_cal.robust.noise import _scale_of_few, noise_of_cameras
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field

@@ -29,7 +29,7 @@ from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import freed, loosely
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import Construction, free_dimensions
-from ceres_cal.robust.camera_noise import noise_of_cameras
+from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.robust.usable import NO_FIT
 from ceres_cal.scene.camera import Camera

@@ -24,8 +24,6 @@ from ceres_cal.scene.symmetry import MIRRORED, TURNED, counterparts
 from ceres_cal.start.initialise import initialise
 
 _One = TypeVar("_One")
-_MOST_CURVES = 12  # of a station: of more, two are outvoted
-_MOST_SEARCHED = 10  # exchanges among five curves: a search for the camera takes half a second
 # Share of the observations that must fit; ratio of what they are off by to that of the next best. With two names
 # exchanged among 4 to 13 curves, the ratio was 17 and more where the camera was lost.
 _FITTING, _BETTER = 0.9, 10.0
@@ -85,12 +83,12 @@ def find_renaming(observations: Observations, options: Options) -> Renaming | No
     """Return the only change of one name with which all curves fit together that some station shows of the world.
     Points beside them decide by themselves.
     """
-    named = _papers(options)
+    named, most_searched = _papers(options), 10  # among five curves: a search for the camera takes half a second
     for station, own, as_named in _misfits(observations, named, have_points=False):
         tried = {one: one.corrected(own) for one in _candidates(own, station)}
         exchanges = {one: seen for one, seen in tried.items() if one.are_exchanged}
         found = _only(tried, named, as_named)
-        if found is None and len(exchanges) <= _MOST_SEARCHED:
+        if found is None and len(exchanges) <= most_searched:
             found = _only(exchanges, named, as_named, may_search=True)
         if found:
             return found
@@ -150,10 +148,11 @@ def _of_world(observations: Observations) -> Observations:
 
 def _candidates(observations: Observations, station: str) -> Iterator[Renaming]:
     """Yield each observed curve under each other name."""
+    most_curves = 12  # of a station: of more, two are outvoted
     for name, target in observations.targets.items():
         own = np.array([view.target == name for view in observations.views])[observations.curves.view]
         shown = [target.curve_names[number] for number in distinct(observations.curves.feature[own])]
-        for number, curve in enumerate(shown if len(shown) <= _MOST_CURVES else ()):
+        for number, curve in enumerate(shown if len(shown) <= most_curves else ()):
             others = (other for other in target.curve_names if other not in shown[: number + 1])
             yield from (Renaming(station, name, curve, other, other in shown) for other in others)
 

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, replace
+from ceres_cal.base import NORMAL_95, Array, Frozen, Indices, Mask, median, mixture_95, replace
 from ceres_cal.effects.linearised import equation_weights, shared_columns, studentised
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Options, Problem, ReducedInformation, Weighting, from_placement
-from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths
+from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths, residuals
 
 if TYPE_CHECKING:
     from ceres_cal.problem.shares import Histogram
@@ -43,11 +43,11 @@ LEAST_SCALE = 3e-3
 # Factor on the stated sigmas up to which noise counts as stated: sigmas are guessed to a tenth or two. Below 1 every
 # sound scene would be a finding; at 2.3, noise of twice the stated one is missed.
 LARGER = 1.15
+# Logarithm of the ratio of noise scales up to which sds are right, as far as hundreds of runs can tell.
+_ALIKE = float(np.log(1.25))
 _BLOCK = 1 << 16  # lengths summed at once, so that intermediate arrays stay in the processor's cache
 _RAYLEIGH_MEDIAN = 1.177410022515474  # median length of a two-dimensional standard normal vector
 _NORMAL_MEDIAN = 0.674489750196082  # median absolute value of a standard normal variable
-_MEDIANS = _RAYLEIGH_MEDIAN, _NORMAL_MEDIAN
-
 
 Redundancy = tuple[float, float]
 """Share of the equations of points, and of curves, that is left for the noise: 1 minus the mean leverage."""
@@ -86,8 +86,8 @@ class Inliers(Frozen):
     bound: float = np.inf
 
     def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
-        """Whether nothing changed that is worth another solve: neither scale by more than `relative`, and no row. If
-        the comparison is not strict, a few of very many rows may differ.
+        """Whether nothing changed that is worth another solve: neither scale by more than `relative`, and no row, or,
+        if the comparison is not strict, only a few of very many.
         """
         changed = self.rows != other.rows
         few = SAME * len(changed) ** 0.5 if relative >= SAME else 0.0
@@ -147,14 +147,6 @@ def median_scales(points: Array, curves: Array) -> tuple[float, float]:
 
 def _median_scale(lengths: Lengths, median_of_one: float) -> float:
     return max(lengths.middle() / median_of_one, LEAST_SCALE) if lengths.count else 1.0
-
-
-def _middle(lengths: Array) -> float:
-    """The median; for very many lengths, the median of a subset."""
-    enough = 5_000
-    some = lengths[:: max(1, len(lengths) // enough)]  # its median is within two hundredths of the median of all
-    middle = len(some) // 2
-    return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
 
 def judge(
@@ -245,9 +237,7 @@ def _scale(sums: _Sums, spare: float, other: _Sums, other_spare: float) -> float
 
 
 def _scale_from(usual: float, sums: _Sums, spare: float) -> float:
-    """The noise scale where a usual one counts for a few degrees of freedom, so that few exact lengths do not make it
-    0.
-    """
+    """The noise scale where a usual one counts, too, so that few exact lengths do not make it 0."""
     return float(np.sqrt((sums[1] + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
 
 
@@ -264,8 +254,10 @@ class EachLength:
         return len(self._seen)
 
     def middle(self) -> float:
-        """The median of the lengths; 0 if there are none."""
-        return _middle(self._seen)
+        """The median of the lengths, of very many that of a subset; 0 if there are none."""
+        enough = 5_000
+        some = self._seen[:: max(1, len(self._seen) // enough)]  # its median is within .02 of the median of all
+        return float(np.partition(some, len(some) // 2)[len(some) // 2]) if len(some) else 0.0
 
     def within(self, bound: float) -> _Sums:
         """Number and sum of squares of the lengths up to the bound."""
@@ -307,26 +299,78 @@ def squares_beside(lengths: Sequence[Array], taken_up: float, reject_sigma: floa
     Args:
         taken_up: share of their equations that unknowns take up. reject_sigma: the outliers' bound at a known scale.
     """
-    firsts = [int(taken_up * len(one)) for one in lengths]
-    each = (2.0, 1.0)  # equations
+    firsts, each = [int(taken_up * len(one)) for one in lengths], (2.0, 1.0)  # equations of each
     spare = sum(e * (len(one) - first) for e, one, first in zip(each, lengths, firsts, strict=True))
     bound = _as_rare(reject_sigma, spare)
     squares = freedom = 0.0
-    for one, first, median, e in zip(lengths, firsts, _MEDIANS, each, strict=True):
+    for one, first, middle, e in zip(lengths, firsts, (_RAYLEIGH_MEDIAN, _NORMAL_MEDIAN), each, strict=True):
         ordered = np.sort(one)
-        count, longest = _spread(EachLength(ordered[first:]), median, bound, 0.0, e)
+        count, longest = _spread(EachLength(ordered[first:]), middle, bound, 0.0, e)
         squares, freedom = squares + longest + float(ordered[:first] @ ordered[:first]), freedom + e * count
     return squares, freedom
 
 
+def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict[str, float]:
+    """The noise of each name in `Observations.noise_names` (a camera, or a target that a camera sees), as a factor on
+    the stated sigmas of its observations; unchanged where all are about equally noisy.
+
+    It differs, for example, in a photograph out of focus, or in a field that was clicked beside detected boards. At the
+    mean noise, the noisiest would seem too certain and the others too uncertain. The unknowns of a camera are divided
+    among its observations by number of equations, those of a pose among the observations that show it. The factor of
+    few observations includes that it is hardly known.
+
+    Args:
+        problem: weighted by the noise of all together. judged: (N + M,) observations that are not known outliers.
+    """
+    observations, layout = problem.observations, problem.layout
+    views = observations.points.view, observations.curves.view
+    every = relative_lengths(observations, residuals(problem.sights, estimate, problem.feet))
+    lengths = [length / scale for length, scale in zip(every, problem.weighting.scales, strict=True)]
+    seen = [own & np.isfinite(one) for own, one in zip(np.split(judged, [len(views[0])]), lengths, strict=True)]
+    counts = [np.bincount(view[own], minlength=len(observations.views)) for view, own in zip(views, seen, strict=True)]
+    equations = 2 * counts[0] + counts[1]
+    names, cameras = np.array(observations.noise_names), np.array([view.camera for view in observations.views])
+    before = np.array([observations.noise.get(name, 1.0) for name in names.tolist()])
+    before /= median(np.repeat(before, equations))
+    noise, spare = dict[str, float](), 0.0
+    for name in dict.fromkeys(names.tolist()):
+        own = names == name
+        count, shown = int(equations[own].sum()), [observations.views[view] for view in np.flatnonzero(own)]
+        if not count:  # all of its observations are left out, or cannot be shown
+            continue
+        camera, now = shown[0].camera, float(before[own][0])
+        poses = len(layout.stations & {view.station for view in shown})
+        poses += len(layout.placements & {view.placement for view in shown})
+        free = len(layout.free.get(camera, ())) / equations[cameras == camera].sum()
+        taken_up, parts = min(free + 6 * poses / count, 1.0), zip(lengths, seen, views, strict=True)
+        relative = [now * length[used & own[view]] for length, used, view in parts]
+        squares, freedom = squares_beside(relative, taken_up, problem.options.reject_sigma)
+        noise[name], spare = _scale_of_few(squares, freedom), spare + freedom
+    # What is common to all does not count: the scale of all together, estimated with the next solve, would cancel it.
+    # Of fewer equations the stated sigmas are taken: factors of a rig of few clicks grew to 50.
+    after = np.array([noise.get(name, np.nan) for name in names.tolist()])
+    usual = median(np.repeat(after, equations))
+    changes = (np.abs(np.log(one / before))[equations > 0] > _ALIKE for one in (after, after / usual))
+    return noise if spare >= LEAST_SPARE and all(map(np.any, changes)) else dict(observations.noise)
+
+
+def _scale_of_few(squares: float, freedom: float) -> float:
+    """The noise scale at which a normal distribution has the 95 % interval of all scales that may be, relative to a
+    usual scale. Half of all scales are within `_ALIKE` of the usual one, and the logarithms of the others follow
+    Cauchy's distribution.
+
+    Args:
+        squares: sum of squared residuals over the usual scale. freedom: their degrees of freedom.
+    """
+    steps, reach, most = 200, 8.0, 6.0  # of the grid; to either side in standard errors of a scale, and at most
+    best = max(float(np.sqrt(squares / freedom)), LEAST_SCALE) if freedom > 0.0 else 1.0
+    logs = np.log(best) + min(reach / (2.0 * max(freedom, 1.0)) ** 0.5, most) * np.linspace(-1.0, 1.0, steps + 1)
+    likely = -freedom * logs - 0.5 * squares * np.exp(-2.0 * logs) - np.log1p((logs / _ALIKE) ** 2)
+    weights = np.exp(likely - likely.max())
+    return mixture_95(weights / weights.sum(), np.exp(2.0 * logs)) / NORMAL_95
+
+
 # ---- outliers by deleted residuals ----------------------------------------------------------------------------------
-
-
-# A deleted residual is the distance of an observation from what the others alone predict. A residual that the fit has
-# taken up is short whether or not the observation is an outlier. A residual that is hardly predicted is long even if
-# the observation is an inlier: the only corner at the rim of a picture would, once rejected, stay rejected. So after
-# convergence, doubtful observations are judged by their deleted residuals in units of those residuals' standard
-# deviations (Cook and Weisberg 1982, Residuals and Influence in Regression, 2.2).
 
 
 class InlierFit(Frozen):
@@ -345,7 +389,13 @@ class InlierFit(Frozen):
 
 
 def by_deleted_residuals(inliers: Inliers, fitted: InlierFit) -> Inliers:
-    """Judge the doubtful ones among the observations by deleted residuals; the others stay as their residuals say."""
+    """Judge the doubtful ones among the observations by deleted residuals; the others stay as their residuals say.
+
+    A deleted residual is the distance of an observation from what the others alone predict. A residual that the fit has
+    taken up is short whether or not the observation is an outlier. A residual that is hardly predicted is long even if
+    the observation is an inlier: the only corner at the rim of a picture would, once rejected, stay rejected (Cook and
+    Weisberg 1982, Residuals and Influence in Regression, 2.2).
+    """
     # Share of the bound beyond which an inlier is doubtful. A shorter residual belongs to an outlier only if it says
     # more about its place than all others do, and then it cannot be known which of the two is wrong.
     doubted = 0.5**0.5
@@ -362,14 +412,12 @@ def deleted_lengths(rows: Mask, weighting: Weighting, fitted: InlierFit) -> tupl
     """The observation numbers of some observations (N + M,) with finite residuals, and the lengths of their deleted
     residuals in standard deviations.
     """
-    estimate = fitted.estimate
     sights = fitted.problem.sights.used(*np.split(rows, [len(fitted.problem.observations.points)]))
-    equations = equations_of(sights, estimate, fitted.residuals)
+    equations = equations_of(sights, fitted.estimate, fitted.residuals)
     weights = equation_weights(weighting, equations, fitted.residuals)
     share = np.where(fitted.used[equations.observation], weights.robust, 0.0)
-    leverage, overlap = _leverages(equations, weights.inverse_sigma, estimate, fitted.reduced)
-    residual = weights.inverse_sigma * equations.residual
-    observation, length = studentised(equations, residual, share, leverage, overlap)
+    leverage, overlap = _leverages(equations, weights.inverse_sigma, fitted.estimate, fitted.reduced)
+    observation, length = studentised(equations, weights.inverse_sigma * equations.residual, share, leverage, overlap)
     return observation, np.abs(length)
 
 
@@ -389,8 +437,7 @@ def _leverages(
         at = {name: number for number, name in enumerate(part.names)}
         placed = np.array([at.get(str(key.placement), -1) for key in equations.sights.keys])[equations.sight]
         rows = np.flatnonzero(placed >= 0)
-        world = estimate.stations[part.station].cam_from_world
-        chain = from_placement(equations.poses, world)[equations.sight[rows]]
+        chain = from_placement(equations.poses, estimate.stations[part.station].cam_from_world)[equations.sight[rows]]
         private[rows] = np.einsum("ei,eij->ej", equations.pose[rows], chain) * weight[rows, None]
         own[rows] = np.einsum("ei,eij->ej", private[rows], part.inverses[placed[rows]])
         told = [column for column, key in enumerate(part.keys) if not key.is_structure]

@@ -33,7 +33,6 @@ _PRIOR_WEIGHT = 0.03
 _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off, in the first and the last round
-_ROUNDS = 12
 # Least share of the strokes in the direction that has fewer, as a floor needs both. Nothing changes from half to
 # double. And the same as a share of what the target has there: fields without touch lines have little.
 _LEAST_SHARE, _LEAST_OF_OWN = 0.06, 0.3
@@ -142,7 +141,7 @@ def _refined(starts: Sequence[Upright], ends: Array, weights: Array, least: floa
     bend, phi = np.array([(one.bend, one.phi) for one in starts]).T
     rotation, share = np.array([one.rotation for one in starts]), weights / weights.sum()
     prior = _PRIOR_WEIGHT * np.array([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(USUAL_PHI_FACTOR) ** -2])
-    for tolerance in np.geomspace(_ROUGH, _FINE, _ROUNDS):
+    for tolerance in np.geomspace(_ROUGH, _FINE, num=12):
         base, columns = _deviation(bend, phi, rotation, ends)
         weighted = columns * (share * np.exp(-((base / tolerance) ** 2)) / tolerance**2)[:, None]
         off = np.stack([0.0 * bend, 0.0 * bend, 0.0 * bend, bend - _USUAL_BEND, np.log(phi / USUAL_PHI)], axis=1)
