@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import pydoc
 from dataclasses import FrozenInstanceError, fields
 from typing import ClassVar
 
@@ -91,3 +92,9 @@ def test_a_default_is_a_value_of_the_class() -> None:
 
     assert NameHolder.name == NameHolder().name == "ring"
     assert not hasattr(NameHolder, "notes")
+
+
+def test_help_shows_it() -> None:
+    """`help(cc.Options)` ended in a TypeError about dataclasses."""
+    text = pydoc.plain(pydoc.render_doc(ColouredRing))
+    assert "ColouredRing(places: 'Array', name: 'str' = 'ring'," in text and "colour: 'int')" in text

@@ -31,7 +31,7 @@ class _Signature:
             default = Parameter.empty if default is MISSING else default
             return Parameter(name, kind, default=default, annotation=one.type)
 
-        every = sorted(_fields_of(owner)[0], key=lambda one: bool(one[1].kw_only))
+        every = sorted(owner.__dataclass_fields__.items(), key=lambda one: bool(one[1].kw_only))
         return Signature([told(*one) for one in every])
 
 
