@@ -491,6 +491,11 @@ def test_of_several_priors_the_worst_is_contradicted_as_rarely_as_one() -> None:
     known = Information.of_sigmas(dict.fromkeys(heights.values(), 0.1))
     assert contradicted_by(stated, there, known, 1000.0) is None
     assert "the stated height of station 'a'" in (contradicted_by(stated[:1], there, known, 1000.0) or "")
+    # Where only the sum is known, its words said "± inf m, 0 sigmas apart", and the file could not be read.
+    two = tuple(heights.values())[:2]
+    both = GaussianPrior(Information.of_sigmas(dict.fromkeys(two, 0.01)), np.array([height_m + 0.3, height_m]))
+    words = contradicted_by([both], there, Information(two, np.full((2, 2), 1e4)), 1000.0) or ""
+    assert re.search(rf"station 'a', .* {height_m:.2f} ± 0.01 m, 21 sigmas apart", words), words
 
 
 def test_lenses_are_chosen_from_the_papers_where_priors_gave_no_start(

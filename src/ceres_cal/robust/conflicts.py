@@ -153,15 +153,18 @@ def _tested(off: Array, stated: Information | None, rest: Rest) -> WaldTest:
     squared = max(float(off @ matrix @ off), 0.0) if stated is None else _squared(off, stated.matrix, matrix)
     own = np.zeros(len(off)) if stated is None else stated.spread.sd
     others, keys = rest.information.spread.sd, rest.information.keys
-    with np.errstate(invalid="ignore"):
+    mean = values_of(rest.estimate, keys) + rest.step - off
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if not np.any(np.isfinite(others)):  # it tells of each number only what it is if the others are as stated
+            others, off = 1.0 / np.sqrt(np.diagonal(matrix)), matrix @ off / np.diagonal(matrix)
         apart = np.nan_to_num(np.abs(off) / np.hypot(own, others))
     worst = int(np.argmax(apart))
-    value = float(values_of(rest.estimate, [keys[worst]])[0] + rest.step[worst])
+    value = float(mean[worst] + off[worst])
     return WaldTest(
         squared,
         log_probability(squared, rest),
         keys[worst],
-        (value - float(off[worst]), float(own[worst])),
+        (float(mean[worst]), float(own[worst])),
         (value, float(others[worst])),
         float(apart[worst]),
     )
