@@ -282,6 +282,13 @@ def test_a_board_that_moves_between_two_shutters_is_named() -> None:
         calibrate(combine(sides), _BROWN)
 
 
+def test_frames_of_one_name_and_of_other_moments_are_named() -> None:
+    """They were refused with "check labels, target dimensions and the lens"."""
+    sides = [_rig(checkerboard(9, 6, 0.1), 5, seed=seed).of_station(name) for seed, name in ((3, "left"), (4, "right"))]
+    with pytest.raises(SolutionError, match="in most frames 'left' and 'right' see the board at different places"):
+        calibrate(combine(sides), _BROWN)
+
+
 def test_a_lost_board_that_both_cameras_see_is_posed_again() -> None:
     """Lenses were compared without it, so that it kept its initial pose, and both of its views were rejected."""
     seen = _rig(checkerboard(9, 6, 0.1), 5)

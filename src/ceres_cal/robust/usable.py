@@ -245,7 +245,10 @@ def lost_sights(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> I
 
         otherwise = shown_otherwise(problem.observations)
     for key, share in lost:
-        checks = otherwise.get((key.station, str(key.placement)), "check its labels, do not use its pose")
+        usual = "check its labels, do not use its pose"
+        if key.placement not in (None, *sights.seen_once):
+            usual = "check its labels, and that all cameras took it at the same moment"
+        checks = otherwise.get((key.station, str(key.placement)), usual)
         words = f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"
         yield LostSight(key, words, key.placement in sights.seen_once)
 

@@ -20,7 +20,7 @@ from ceres_cal.start.same_labels import Both, apart, beside_the_first, is_clearl
 _FEWEST = 4  # moments from which on the cameras can be compared: of three, two agree by chance
 _ADVICE = (
     "the pictures were not taken at the same moment, or a camera was moved: take them all at once, hold the board "
-    "still meanwhile, or keep each shared frame of one camera only"
+    "still meanwhile, or give the frames of each camera names of their own"
 )
 
 
@@ -69,11 +69,10 @@ def _by_own_poses(problem: Problem, estimate: Estimate) -> dict[str, float]:
 
 def shifted(observations: Observations) -> Iterator[str]:
     """Descriptions of stations whose frames match those of the first one only after a shift."""
-    alike = 0.15  # difference that initial estimates of equal poses may have, see `same_labels`
     for moments in _moments(observations):
         costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
         best = min(costs, key=costs.__getitem__)
-        if is_clearly_more(costs[0], costs[best]) and costs[best] < alike:
+        if is_clearly_more(costs[0], costs[best]) and costs[best] < moments.alike:
             where = f"{counted(abs(best), 'frame')} {'later' if best > 0 else 'earlier'}"
             yield (
                 f"frames of {moments.first!r} and {moments.second!r} are shifted: what {moments.first!r} shows in a "
@@ -88,6 +87,10 @@ def told_apart(observations: Observations) -> Iterator[str]:
         (station, placement), words = next(iter(every.items()))
         others = f" and at {counted(len(every) - 1, 'other')}" if len(every) > 1 else ""
         yield f"station {station!r}, placement {placement!r}{others}: {words}"
+    for moments in _moments(observations):
+        if is_clearly_more(moments.cost(0), moments.alike):
+            stations = f"{moments.first!r} and {moments.second!r}"
+            yield f"in most frames {stations} see the board at different places: {_ADVICE}"
 
 
 def shown_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
@@ -103,6 +106,8 @@ def shown_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
 
 class _Moments:
     """Two stations, with the poses of boards by each of them, moment by moment."""
+
+    alike = 0.15  # difference that initial estimates of equal poses may have, see `same_labels`
 
     def __init__(self, first: str, second: str, poses: Both) -> None:
         most = 40  # moments used, since all are compared with all, for all shifts
