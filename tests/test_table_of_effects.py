@@ -17,7 +17,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects import table
-from ceres_cal.effects.table import EFFECTS, rows
+from ceres_cal.effects.table import EFFECTS, rows, targets
 from ceres_cal.observations import COMA, Observations, Prior
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.quantities import difference
@@ -174,3 +174,9 @@ def test_coma_is_stated_with_the_observations_that_it_is_in() -> None:
     (name,) = observations.cameras
     with pytest.raises(InputError, match="it has no 'coma'"):
         calibrate(observations, Options(priors=(Prior("camera", name, COMA, (0.0,), (3.0,)),)))
+
+
+def test_the_tolerance_that_is_advised_fits_what_was_found() -> None:
+    """10 mm were advised for a line 77 mm aside: of 14 such fields none was trusted with that, 5 are with 80 mm."""
+    found = [np.array(mm) for mm in ([3.0], [-76.9], [0.3, -0.5, -53.1])]
+    assert [targets._tolerance(0.01, mm) for mm in found] == ["0.01", "0.08", "0.05"]

@@ -79,12 +79,17 @@ def feature_of(name: str) -> str:
     return name
 
 
+def _tolerance(usual_m: float, mm: Array) -> str:
+    """A tolerance in metres under which such offsets are found: one of 10 mm holds a line that lies 70 mm off."""
+    return f"{max(usual_m, 1e-3 * float(np.max(np.abs(mm)))):.1g}"
+
+
 def _of_curve(evidence: Evidence) -> Words:
     name = evidence.score.subject
     target, _, feature = name.partition("/")
     curve = evidence.case.problem.observations.targets[target].curves[feature]
     mm, sd = evidence.in_mm
-    advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
+    advice = f"measure it, or solve for it: --tolerance {target}.lines_m={_tolerance(0.01, mm)}"
     if isinstance(curve, Arc):
         how = f"its centre x {mm[0]:+.1f}, y {mm[1]:+.1f} mm and its radius {mm[2]:+.1f} mm off"
         return evidence.words(f"{name} is not painted as drawn: {how}", advice, ("x", "y", "radius"), "mm")
@@ -103,7 +108,7 @@ def _of_point(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
     return evidence.words(
         f"{name} lies x {with_sd(mm[0], sd[0], '+')}, y {with_sd(mm[1], sd[1], '+')} mm from its nominal position",
-        f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
+        f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m={_tolerance(0.005, mm)}",
         "xy",
         "mm",
     )
@@ -149,7 +154,7 @@ def _of_board(evidence: Evidence) -> Words:
     return evidence.words(
         f"board {name!r} is not flat: bowed by {with_sd(mm[0], sd[0], '+')} mm along x, "
         f"{with_sd(mm[1], sd[1], '+')} mm along y{''.join(f', {one}' for one in further)}",
-        f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
+        f"mount it on something flat, or solve for it: --tolerance {name}.warp_m={_tolerance(0.002, mm)}",
         WARP,
         "mm",
     )
