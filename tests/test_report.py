@@ -290,7 +290,10 @@ def test_a_fault_that_moves_places_by_little_is_counted() -> None:
     sd = sound.uncertainty.posterior.sd_of(*key[:3])
     fault = replace(sound.diagnosis.findings[0], wrong="model", effect_mm=1.0)
     step = sound.diagnosis.step
-    along_x = motion_columns(step.case)[:, 3:4]
+    shifts = motion_columns(step.case)[:, 3:]
+    share, along_x = np.abs(shifts) / np.linalg.norm(shifts, axis=1, keepdims=True), shifts[:, :1]
+    # Of a frame that shows lines along x alone it was said that it is shifted by 1e16 mm along x.
+    assert np.any(share == 0.0) and np.all((share == 0.0) | (share > 1e-9))
     shifted = EffectColumns(along_x, np.zeros(len(along_x), dtype=np.int64), ("overhead",), kind="moved in")
     cause = ScoreTest(shifted, 0, 0.0, 1, 0.0, np.ones(1), np.ones(1))
     for sigmas, level in ((0.05, "good"), (30.0, "no")):

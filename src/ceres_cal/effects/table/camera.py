@@ -54,14 +54,13 @@ def _of_move(evidence: Evidence) -> Words:
     one_frame = f"in frame {score.frame!r} alone", "leave this frame out, or give it a station of its own"
     when, advice = frames_after if score.effect.onwards else one_frame
     turns, steps = [f"turn about the camera's {axis}" for axis in "xyz"], [f"shift along {axis}" for axis in "xyz"]
-    return Words(
-        f"station {score.subject!r} moved {when}: {how}; {evidence.size}",
-        advice,
-        (
-            *amounts(turns, np.degrees(score.amount[:3]), np.degrees(score.sd[:3]), "deg"),
-            *amounts(steps, 1e3 * score.amount[3:], 1e3 * score.sd[3:], "mm"),
-        ),
+    every = (
+        *amounts(turns, np.degrees(score.amount[:3]), np.degrees(score.sd[:3]), "deg"),
+        *amounts(steps, 1e3 * score.amount[3:], 1e3 * score.sd[3:], "mm"),
     )
+    columns = score.columns[evidence.case.model.used].T
+    told = tuple(one for one, column in zip(every, columns, strict=True) if np.any(column))
+    return Words(f"station {score.subject!r} moved {when}: {how}; {evidence.size}", advice, told)
 
 
 def motion_columns(case: Case) -> Array:
@@ -74,7 +73,10 @@ def motion_columns(case: Case) -> Array:
         here = slice(equations.bounds[number], equations.bounds[number + 1])
         turned = equations.motion[here] @ -skew(equations.poses[number, :, 3])
         columns[here, :3] = equations.pose[here, :3] + turned
-        columns[here, 3:] = -equations.motion[here] @ case.estimate.stations[key.station].cam_from_world.rotation
+        shift = -equations.motion[here] @ case.estimate.stations[key.station].cam_from_world.rotation
+        # A shift along all lines of a frame displaces none of them, but by rounding.
+        along = np.abs(shift) < 1e-9 * np.linalg.norm(shift, axis=1, keepdims=True)
+        columns[here, 3:] = np.where(along, 0.0, shift)
     return columns
 
 
