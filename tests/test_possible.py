@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from scenery import board_scene, field_scene, overhead_pose
+from scenery import board_scene, field_scene, join, overhead_pose
 from scenes import RADIAL, SCENES, camera
 from thorough import partly
 
@@ -31,7 +31,7 @@ from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.robust.usable import require_possible, require_usable
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
-from ceres_cal.scene.targets import Target, checkerboard, custom, ssl_field
+from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 from ceres_cal.start import initialise
 
@@ -124,6 +124,32 @@ def judged(points: dict[str, tuple[float, float, float]], pose: Pose) -> None:
     estimate = Estimate({"a": above}, {"a": CameraPlaces("a", pose)}, {}, EXACT)
     sights = gather_sights(seen)
     require_possible(sights, estimate, residuals(sights, estimate))
+
+
+@pytest.mark.parametrize("lines", [2, 4])
+def test_boards_under_two_lines_that_cross_are_not_too_large(lines: int) -> None:
+    """Two lines look the same from near and from far. It was said of the board that its dimensions are too large."""
+    ends = {
+        "a": (-1.0, 0.5, 1.0, 0.5),
+        "b": (0.5, -1.0, 0.5, 1.0),
+        "c": (-1.0, -0.5, 1.0, -0.5),
+        "d": (0.0, -1.0, 0.0, 1.0),
+    }
+    field = custom({}, {n: Segment((a, b, 0.0), (c, d, 0.0)) for n, (a, b, c, d) in [*ends.items()][:lines]})
+    lens = camera("radial-3")
+    there = {"a": Station("a", overhead_pose(0.2, 0.1, 3.0, tilt_x_deg=5.0))}
+    scene = join(
+        field_scene(field, {"a": lens}, there, spacing_m=0.2),
+        board_scene(checkerboard(5, 4, 0.1), {"a": lens}, there, 3, 1),
+    )
+    sights = gather_sights(simulate(scene).observations)
+    pose, corner = there["a"].cam_from_world, np.array([0.5, 0.5, 0.0])
+    near = Pose(pose.rotation, 0.3 * pose.translation - 0.7 * pose.rotation @ corner)  # 30 % of the distance from there
+    placements = {name: near.inverse @ pose @ placed for name, placed in scene.placements.items()}
+    estimate = Estimate({"a": lens}, {"a": CameraPlaces("a", near)}, placements, EXACT)
+    said = "does not determine its pose" if lines == 2 else "its dimensions are too large"
+    with pytest.raises(SolutionError, match=said):
+        require_possible(sights, estimate, residuals(sights, estimate))
 
 
 def turned_upwards(height_m: float) -> Pose:

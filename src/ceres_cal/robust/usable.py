@@ -17,10 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base import Array, Mask, SolutionError, distinct, median
+from ceres_cal.base import Array, CalibrationError, Mask, SolutionError, attempt, distinct, median
 from ceres_cal.effects import AsBuilt
-from ceres_cal.observations import Observations, SightKey, Sights
+from ceres_cal.observations import SightKey, Sights
 from ceres_cal.problem import Estimate, Problem, Residuals, floor_of
+from ceres_cal.problem.residuals import residuals as residuals_at
+from ceres_cal.problem.residuals import write_equations
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.other_minima import LOST
 from ceres_cal.robust.robust import RobustSolution
@@ -76,24 +78,41 @@ def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -
                 f"sees: {_cause(camera)}, or left and right, or top and bottom, are exchanged in the labels: correct "
                 "the observations"
             )
-        _require_ahead(station, sight, residuals)
+        _require_ahead(station, sight, residuals, estimate)
         if floor_m is not None:
-            _require_above(floor_m - _BELOW * (camera.position[2] - floor_m), sights.observations, estimate)
+            _require_above(floor_m - _BELOW * (camera.position[2] - floor_m), sight, estimate)
 
 
-def _require_above(least_m: float, observations: Observations, estimate: Estimate) -> None:
+def _open_pose(sight: Sights, estimate: Estimate) -> str:
+    """The cause of an impossible position where a sight of the world leaves a pose open through any lens, as two lines
+    do that cross; "" where it does not.
+    """
+    # quiet: where nothing at all is shown, the labels are the likelier cause
+    equations = attempt(lambda: write_equations(sight, estimate, residuals_at(sight, estimate)))
+    if isinstance(equations, CalibrationError):
+        return ""
+    pose = equations.pose
+    if np.linalg.matrix_rank(pose / np.maximum(np.linalg.norm(pose, axis=0), 1e-300), 1e-6) == pose.shape[1]:
+        return ""
+    return "what it shows of the world does not determine its pose: add points, lines in other places or arcs"
+
+
+def _require_above(least_m: float, sight: Sights, estimate: Estimate) -> None:
     """Raise SolutionError where most placements of a target lie so deep under the floor that its size must be wrong."""
+    observations, station = sight.observations, sight.keys[0].station
     for name, target in observations.targets.items():
         placed = dict.fromkeys(v.placement for v in observations.shown_views if v.target == name and v.placement)
         tops = [float(np.max(estimate.placements[one].transform(target.places)[:, 2])) for one in placed]
         if target.movable and 2 * np.count_nonzero(np.array(tops) < least_m) > len(tops):
+            if open_pose := _open_pose(sight, estimate):
+                raise SolutionError(f"station {station!r}: {open_pose}")
             raise SolutionError(
                 f"target {name!r} lies up to {-min(tops):.0f} m under the floor: its dimensions are too large, or not "
                 "in metres"
             )
 
 
-def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
+def _require_ahead(station: str, sight: Sights, residuals: Residuals, estimate: Estimate) -> None:
     """Raise SolutionError where most of what the station observed lies behind it, or beyond its lens."""
     points, curves = residuals.lengths
     lengths = np.concatenate([points[sight.point_rows], curves[sight.curve_rows]])
@@ -101,7 +120,7 @@ def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
     if 2 * behind > len(lengths):
         raise SolutionError(
             f"station {station!r}: {behind} of its {len(lengths)} observations of fixed targets lie behind the "
-            "camera or beyond its lens: check labels and target dimensions"
+            f"camera or beyond its lens: {_open_pose(sight, estimate) or 'check labels and target dimensions'}"
         )
 
 
