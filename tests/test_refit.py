@@ -389,6 +389,17 @@ def test_mirrored_labels_are_said(calibration: Calibration, observations: Observ
         refit(calibration, mirrored)
 
 
+def test_mirrored_labels_of_a_field_that_is_nearly_symmetric_are_said(calibration: Calibration) -> None:
+    """All but the lines of a penalty area fit as well; these were taken out, and a place 4 m off was trusted."""
+    stations = {"overhead": Station("overhead", overhead_pose(-1.5, 0.8, 4.2, 3.0, -2.0, 92.0))}
+    seen = simulate(field_scene(FIELD, {"overhead": CAMERA}, stations, points=(), spacing_m=0.3), DAY, 6).observations
+    shown = only(seen, "TopTouchLine", "HalfwayLine", "CenterLine", "CenterCircle", "LeftPenaltyStretch")
+    mirrored = relabelled(shown, MIRRORED)
+    assert mirrored is not None and not refit(calibration, shown).conflicts
+    with pytest.raises(SolutionError, match="with mirrored labels they do"):
+        refit(calibration, mirrored)
+
+
 def test_another_field_is_said(calibration: Calibration) -> None:
     stations = {"overhead": Station("overhead", MOVED)}
     scene = field_scene(ssl_field("A"), {"overhead": CAMERA}, stations, spacing_m=0.3)

@@ -42,6 +42,7 @@ _SUPPORTED = 10.0
 # within the second of its old place (m), turned by less than the third (rad). Nothing changes from half to double.
 _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
 _TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+_MIRRORED = "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
 
 _WIDER = {
     "pose-only": ("zoom", "iris", "everything"),
@@ -144,11 +145,8 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     misfit = f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
     old = old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
-    mirrored = relabelled(search.sight.observations, MIRRORED)
-    if mirrored is not None and _fits(_seen_as(search, mirrored), old, known):
-        yield SolutionError(
-            f"{misfit}with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
-        )
+    if _fits_mirrored(search, old, known):
+        yield SolutionError(f"{misfit}{_MIRRORED}")
     for name, observations in mistaken_targets(search.sight.observations).items():
         if _fits(_seen_as(search, observations), old, known):
             yield SolutionError(f"{misfit}on {name} they do: this is the wrong field: correct the target's dimensions")
@@ -165,6 +163,11 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
     if noise < NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
         yield SolutionError(f"{misfit}with another lens they do: {WORDS['everything']}: calibrate it anew")
+
+
+def _fits_mirrored(search: PoseSearch, old: list[Pose], known: float) -> bool:
+    mirrored = relabelled(search.sight.observations, MIRRORED)
+    return mirrored is not None and _fits(_seen_as(search, mirrored), old, known)
 
 
 def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
@@ -294,7 +297,20 @@ def supported(
             raise why_nothing_fits(plan, searches)
         if (other := _other_explanation(plan, searches)) is not None:
             raise other
+    if result.outliers:
+        _require_unmirrored(plan, result)
     return rivals
+
+
+def _require_unmirrored(plan: RefitPlan, result: Calibration) -> None:
+    """Raise SolutionError where mirrored labels explain what was taken out, too. Most of a field is symmetric, so a
+    mirrored picture of it fits except for some lines.
+    """
+    for search in _solved_searches(plan, result):
+        pose = result.estimate.stations[search.sight.key.station].cam_from_world
+        if _fits_mirrored(search, [*old_poses(plan, search), pose], candidate_at(search, pose).misfit):
+            station = search.sight.key.station
+            raise SolutionError(f"station {station!r}: some of its observations do not fit the others; {_MIRRORED}")
 
 
 def _rivals(
@@ -316,10 +332,13 @@ def _explains(plan: RefitPlan, result: Calibration) -> bool:
 
     The noise of its few points alone does not show that: three of five may be strays.
     """
-    moved = (sight for name, sight in plan.sights.of_world.items() if name in plan.moved)
-    searches = [PoseSearch(sight, result.estimate, plan.scales) for sight in moved]
-    stations = result.estimate.stations
+    stations, searches = result.estimate.stations, _solved_searches(plan, result)
     return all(candidate_at(one, stations[one.sight.key.station].cam_from_world).fits for one in searches)
+
+
+def _solved_searches(plan: RefitPlan, result: Calibration) -> list[PoseSearch]:
+    moved = (sight for name, sight in plan.sights.of_world.items() if name in plan.moved)
+    return [PoseSearch(sight, result.estimate, plan.scales) for sight in moved]
 
 
 def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
