@@ -389,11 +389,31 @@ def test_a_group_that_nearly_alone_tells_a_coefficient_scatters_no_more_than_the
     assert 0.75 < np.mean(ratios) < 1.2  # 0.87 measured
 
 
-def _groups_of_ten(shared: float, seed: int, alone: float = 1.0) -> GroupNormals:
+def test_a_group_is_predicted_with_the_variance_of_the_noise_and_of_the_prediction() -> None:
+    """Compared with the covariance of each group's residuals, written out, and what all others predict for them."""
+    columns, errors = _columns_of_ten(0.0, 3, alone=5.0)
+    _, foreseen, spread, _ = _normals_of(columns, errors).held_out([{}])
+    for number, (own, off) in enumerate(zip(columns, errors, strict=True)):
+        others = np.concatenate(np.delete(columns, number, axis=0))
+        step, *_ = np.linalg.lstsq(others, np.concatenate(np.delete(errors, number, axis=0)), rcond=None)
+        covariance, left = np.eye(10) + own @ np.linalg.inv(others.T @ others) @ own.T, off - own @ step
+        assert foreseen[0, number] == pytest.approx(left @ np.linalg.solve(covariance, left), rel=1e-3)  # 8e-5 measured
+        assert spread[0, number] == pytest.approx(np.linalg.slogdet(covariance)[1], abs=0.02)  # 0.006 measured
+
+
+def _columns_of_ten(shared: float, seed: int, alone: float = 1.0) -> tuple[Array, Array]:
+    """(40, 10, 4) columns and (40, 10) errors of 40 groups."""
     rng = np.random.default_rng(seed)
     columns = rng.standard_normal((40, 1, 4)) + 0.1 * rng.standard_normal((40, 10, 4))
     columns[0, :, 0] *= alone
-    errors = rng.standard_normal((40, 10)) + shared * rng.standard_normal((40, 1))
+    return columns, rng.standard_normal((40, 10)) + shared * rng.standard_normal((40, 1))
+
+
+def _groups_of_ten(shared: float, seed: int, alone: float = 1.0) -> GroupNormals:
+    return _normals_of(*_columns_of_ten(shared, seed, alone))
+
+
+def _normals_of(columns: Array, errors: Array) -> GroupNormals:
     normal = np.einsum("gik,gil->gkl", columns, columns)
     gradient, squares = np.einsum("gik,gi->gk", columns, errors), np.sum(errors**2, axis=1)
     keys, sizes = tuple(Key("camera", "camera", f"k{n}", "") for n in range(4)), np.einsum("gkk->k", normal)
@@ -570,7 +590,7 @@ def test_a_shorter_lens_is_the_longest_with_coefficients_at_0() -> None:
     normals, _ = _normals(observations, calibration)
     keys = [key for key in normals.keys if key.quantity in ("a4", "a5")]
     held = {key: -calibration.station().lens.coefficients[key.quantity] for key in keys}
-    _, (step,) = normals.held_out([held])
+    *_, (step,) = normals.held_out([held])
     shorter = calibrate(observations, replace(_PLAIN, lens="radial"))
     there = {key.quantity: value for key, value in zip(normals.keys, step, strict=True)}
     sd = shorter.uncertainty.posterior.sd_of("camera", "camera", "phi")

@@ -403,7 +403,7 @@ def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
 
 def _probabilities(among: Sequence[Candidate]) -> list[float]:
     """Return the probability of each lens that it predicts best; 0 for lenses that failed."""
-    known = {i: one.squares for i, one in enumerate(among) if one.squares is not None}
+    known = {i: one.densities for i, one in enumerate(among) if one.squares is not None}
     likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
     return [likely.get(i, 0.0) for i in range(len(among))]
 

@@ -198,7 +198,7 @@ def decide(
     return best, next((i for i in near if not is_refuted(i)), best)
 
 
-def pseudo_bma(squares: Sequence[Array]) -> Array:
+def pseudo_bma(densities: Sequence[Array]) -> Array:
     """Return the (L,) probability of each lens that it predicts best: likelihoods, averaged over draws of groups.
 
     This is Pseudo-BMA+ of Yao, Vehtari, Simpson and Gelman (Bayesian Analysis 13, 2018, section 3.4), except that the
@@ -206,9 +206,9 @@ def pseudo_bma(squares: Sequence[Array]) -> Array:
     1969), so that nothing in them is random.
 
     Args:
-        squares: (G,) squared errors of each lens by group.
+        densities: (G,) minus twice the logarithm of the density that each lens predicts for each group.
     """
-    each = np.array(squares)
+    each = np.array(densities)
     more = _half_samples(each.shape[1]) @ each.T
     likelihoods = np.exp(more.min(axis=1, keepdims=True) - more)
     return np.asarray(np.mean(likelihoods / likelihoods.sum(axis=1, keepdims=True), axis=0))

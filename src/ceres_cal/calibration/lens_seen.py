@@ -74,12 +74,13 @@ class Kind(Frozen):
     @cached_property
     def _every(self) -> list[Candidate]:
         """All of its lenses; computing them together takes hardly longer than one."""
-        if self.normals is None:
+        if (normals := self.normals) is None:
             return [Candidate(form, self, failed=self.failed) for form in self.forms]
-        counts, (squares, steps) = self.normals.counts, self.normals.held_out([*map(self.to_nothing, self.forms)])
-        rms_px = self.sigma_px * np.sqrt(np.maximum(squares.sum(axis=1), 0.0) / counts.sum())
-        each = zip(self.forms, surprise(squares, counts), rms_px.tolist(), steps, strict=True)
-        return [Candidate(form, self, own, rms, at, self.normals.squares_at(at)) for form, own, rms, at in each]
+        squares, foreseen, spread, steps = normals.held_out([*map(self.to_nothing, self.forms)])
+        rms_px = self.sigma_px * np.sqrt(np.maximum(squares.sum(axis=1), 0.0) / normals.counts.sum())
+        told = 2.0 * surprise(foreseen, normals.counts) + spread  # Student's t: as many degrees of freedom as residuals
+        each = zip(self.forms, surprise(squares, normals.counts), told, rms_px.tolist(), steps, strict=True)
+        return [Candidate(form, self, own, said, rms, at, normals.squares_at(at)) for form, own, said, rms, at in each]
 
     def slopes(self, lenses: OtherLenses) -> Sequence[Array]:
         """Return the derivatives of the places that pixels show by its numbers, see `shown_slopes`."""
@@ -125,12 +126,14 @@ class Candidate(Frozen):
 
     Attributes:
         squares: (G,) squared error of predicting each group, in variances; None where it cannot be used, see `failed`.
+        densities: (G,) minus twice the logarithm of the density that it predicts for each group.
         rms_px: of all predictions. step: from the kind's estimate to this lens's minimum. least: sum of squares there.
     """
 
     form: Form
     of: Kind
     squares: Array | None = None
+    densities: Array = field(default_factory=lambda: np.empty(0))
     rms_px: float = np.nan
     step: Array = field(default_factory=lambda: np.empty(0))
     least: float = np.nan

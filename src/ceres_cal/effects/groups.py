@@ -94,9 +94,11 @@ class GroupNormals(Frozen):
         moved = (along @ np.swapaxes(turn, 1, 2))[:, 0] @ axes
         return float(len(moved) * np.mean(moved**2))
 
-    def held_out(self, every: Sequence[Mapping[Key, float]]) -> tuple[Array, Array]:
-        """(F, G) squared errors of each group predicted from all others, and the steps (F, K) to the least squares, if
-        some numbers are held at given distances from their present values; one row for each of F choices.
+    def held_out(self, every: Sequence[Mapping[Key, float]]) -> tuple[Array, Array, Array, Array]:
+        """Predict each group from all others, if some numbers are held at given distances from their present values.
+
+        Returns one row for each of F choices: (F, G) squared errors; (F, G) those in variances of noise and prediction
+        together, and (F, G) the logarithm of the determinant of these variances; (F, K) the steps to the least squares.
         """
         steps = np.array([[held.get(key, 0.0) for key in self.keys] for held in every])
         roots = self._roots(every)
@@ -106,8 +108,9 @@ class GroupNormals(Frozen):
         gradient = ((self.gradient + moved) @ roots)[:, :, :, None]
         own, rest = self._split(roots)
         without = np.linalg.solve(rest, gradient)
+        foreseen = squares + np.sum(gradient * without, axis=(2, 3))
         squares += np.sum((2.0 * gradient + own @ without) * without, axis=(2, 3))
-        return squares, steps
+        return squares, foreseen, -np.linalg.slogdet(rest)[1], steps
 
     def root(self, held: Collection[Key], stated: Array | float = 0.0) -> Array:
         """(K, K) a root of the covariance of the numbers, if some are held.
