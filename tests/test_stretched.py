@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from thorough import partly
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibration import Calibration
@@ -84,7 +85,7 @@ def test_square_pixels_stay_square(name: str) -> None:
     assert _off_over_stated(calibration, camera) < 1.5  # .82 and .20
 
 
-@pytest.mark.parametrize("aspects", [(1.02, 1.02), (1.0, 1.03), (1.0, 1.0)])
+@pytest.mark.parametrize("aspects", partly([(1.02, 1.02), (1.0, 1.03), (1.0, 1.0)], always=[(1.0, 1.0), (1.02, 1.02)]))
 def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, float]) -> None:
     """Both were taken as square to 0.0005: errors at robot height were 19 radii."""
     cameras = {name: _StretchedCamera(name, aspect) for name, aspect in zip(_CAMERAS, aspects, strict=True)}
