@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ceres_cal.base import Array, Array32, Indices, Indices32, Mask, Rows, median, medians, medians_known, quantile
+from ceres_cal.detect.asymmetry import drawn_together
 from ceres_cal.detect.blur import blur_of, from_middle, no_blur, with_coma
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
@@ -211,6 +212,9 @@ def measure(
     sigma = np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), open_px)
     found = _goes_on(course, found, offset, sigma)
     offset = np.where(found, offset, np.nan)
+    if coma is None and not np.any(blur.smear_px):  # coma is asymmetric, too, and has a standard deviation of its own
+        middle, half = np.where(found, fits.offset_px, np.nan), 0.5 * blur.stretch * course.width_px
+        sigma = np.hypot(sigma, drawn_together(windows, course, middle, contrast, half, blur.blur_px))
     return Lines(course, found, offset, sigma, blur.usual_px, blur.stretch, coma_px)
 
 
