@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
+import pkgutil
 import pydoc
 from dataclasses import FrozenInstanceError, fields
+from importlib import import_module
 from typing import ClassVar
 
 import msgspec
 import numpy as np
 import pytest
 
+import ceres_cal
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 
@@ -98,3 +102,15 @@ def test_help_shows_it() -> None:
     """`help(cc.Options)` ended in a TypeError about dataclasses."""
     text = pydoc.plain(pydoc.render_doc(ColouredRing))
     assert "ColouredRing(places: 'Array', name: 'str' = 'ring'," in text and "colour: 'int')" in text
+
+
+def test_help_shows_every_class() -> None:
+    """`help(cc.formats)` ended in a NameError: msgspec evaluates annotations that only type checkers import."""
+    homes = [
+        module.name for module in pkgutil.walk_packages(ceres_cal.__path__, "ceres_cal.") if "__" not in module.name
+    ]
+    every = [held for home in homes for held in vars(import_module(home)).values() if inspect.isclass(held)]
+    ours = {held for held in every if held.__module__.startswith("ceres_cal.") and not issubclass(held, BaseException)}
+    assert len(ours) > 300
+    for held in ours:
+        inspect.signature(held)

@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
-from msgspec import Struct
-
 from ceres_cal import scene
 from ceres_cal.base import Frozen, InputError, field, make_folder, short, write_bytes
 
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
     from ceres_cal.observations import Observations
 
 
-class ExportLoss(Struct, frozen=True):
+class ExportLoss(Frozen, eq=True):
     """Errors of a file for one station, compared with the calibration that it was made from; 0 where it is exact.
 
     Attributes:
@@ -71,7 +69,7 @@ class Export(Frozen):
             write_bytes(folder / name, content)
 
 
-class ExportRequest(Struct, frozen=True, eq=False):
+class ExportRequest(Frozen):
     """A request to export stations of a calibration.
 
     Attributes:
@@ -86,7 +84,7 @@ class ExportRequest(Struct, frozen=True, eq=False):
     existing: bytes | None = None
 
 
-class ExportFormat(Struct, frozen=True):
+class ExportFormat(Frozen):
     """A format for export.
 
     Attributes:
@@ -123,7 +121,7 @@ def _options(work: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-class ImportRequest(Struct, frozen=True, eq=False):
+class ImportRequest(Frozen):
     """A file or folder to read.
 
     Attributes:
@@ -139,7 +137,7 @@ class ImportRequest(Struct, frozen=True, eq=False):
         return self.content.decode("utf-8-sig", errors="replace")
 
 
-class ImportFormat(Struct, frozen=True):
+class ImportFormat(Frozen):
     """A format for import.
 
     Attributes:
