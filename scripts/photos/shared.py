@@ -159,6 +159,8 @@ def _of_all(found: Mapping[str, Sequence[Outcome]]) -> Iterator[Row]:
     both = float(np.mean([not any(one.why for one in ways) for ways in found.values()]))
     yield Row("all photographs", "share found in every way", both, least=0.95, note=note)
     every = [one for ways in found.values() for one in ways if not one.why]
+    ratios = np.sqrt(np.mean([one.over_stated**2 for one in every if np.isfinite(one.stated_mm)]))
+    yield Row("all photographs", "rms error over stated", float(ratios), least=1.0 / STATED, most=STATED)
     yield Row("all photographs", "wrong, but trusted", sum(one.certified for one in every), most=0.0)
     sound = [one for one in every if not one.beyond > MOST_BEYOND and one.mean_mm < MOVED_MM]
     trusted = float(np.mean([one.trusted for one in sound]))
