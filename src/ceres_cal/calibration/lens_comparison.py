@@ -113,7 +113,7 @@ def compared_kinds(
         CalibrationError: too few observations to compare lenses, or no calibration.
     """
     least_rows, most_rows, share, fewest_frames = 1_000, 12_000, 0.025, 24  # limits of how many observations take part
-    every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
+    every, observations = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST), observations.originals
     most = most_rows if by_most else max(least_rows, int(share * observations.rows))
     few = thinned(observations, most, fewest_frames)
     sights = built.held(gather_sights(few))

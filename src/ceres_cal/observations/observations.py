@@ -239,10 +239,15 @@ class Observations(Content):
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
+    @property
+    def originals(self) -> Observations:
+        """The observations that are no copies of others."""
+        return self.part(*self.copies.originals) if self.copies.are_there else self
+
     def part(self, points: Mask | Indices, curves: Mask | Indices) -> Observations:
         """Return the same views with some of the observations, given by number or by a mask."""
         part = replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
-        if "copies" in vars(self) and not self.copies.are_there:  # a part has no copies either
+        if "copies" in vars(self):  # a part of a view need not look like a copy
             vars(part)["copies"] = Copies(self.copies.points[points], self.copies.curves[curves])
         return part
 
@@ -256,7 +261,7 @@ class Observations(Content):
         if all(one == other and one.movable == other.movable for one, other in each):
             return self
         drawn = replace(self, targets=dict(targets))
-        vars(drawn)["digest"] = self.digest
+        vars(drawn).update(digest=self.digest, copies=self.copies)
         return drawn
 
     @property
@@ -279,7 +284,7 @@ class Observations(Content):
         factors = after / before
         points, curves = (replace(c, sigma_px=c.sigma_px * factors[c.view]) for c in (self.points, self.curves))
         rated = replace(self, points=points, curves=curves, noise=dict(noise))
-        vars(rated)["digest"] = self.digest
+        vars(rated).update(digest=self.digest, copies=self.copies)
         return rated
 
     def of_station(self, name: str) -> Observations:
