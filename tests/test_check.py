@@ -157,6 +157,14 @@ def test_another_zoom_or_focus_is_named(calibration: Calibration) -> None:
     assert _checked_station(found).data["stations"]["overhead"]["cause"] == "iris"  # in the JSON of the command, too
 
 
+def test_a_stretched_picture_is_no_noise(calibration: Calibration) -> None:
+    """It was taken for much noise, so that the check held, or for a movement; places were off by 0.1 to 0.2 m."""
+    for aspect in (0.96, 1.04, 1.07):
+        observations = seen(HOME, NOISE, 8, camera=replace(CAMERA, aspect=aspect)).observations
+        found = check(calibration, observations)["overhead"]
+        assert not found.holds and found.cause == "everything" and "stretched" in found.words, found.words
+
+
 def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibration) -> None:
     without = replace(calibration, targets={})
     for pose, words in (

@@ -13,7 +13,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, checked, numerical, or_none, replace
+from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, checked, log_f_tail, numerical, or_none, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibration import loosened
 from ceres_cal.effects.dependence import measure_scatter
@@ -222,7 +222,10 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
         anywhere = case.prior.without(case.station_keys)
         of_lens = _apart(case.loosened, used, lensed, anywhere, case.lens_keys)[1]
         apart = min(apart, of_lens, key=lambda one: one.probability)
-    probability = min(2.0 * apart.probability, 1.0)  # corrected for two tests
+    least_probable = apart.probability
+    if noise > NOISIER:
+        least_probable = min(least_probable, _noise_is_no_other_lens(case, used, posed))
+    probability = min(2.0 * least_probable, 1.0)  # corrected for two tests
     holds = probability >= level
     cause, estimate = (None, posed[1]) if holds else _cause(case, used, posed)
     answer = Agreement(
@@ -238,14 +241,27 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
     return replace(answer, words=_words(answer))
 
 
+def _noise_is_no_other_lens(case: _CheckCase, used: Sights, posed: _Fit) -> float:
+    """Return the probability by which noise looks as if another lens explained it: an F-test of all intrinsics free
+    beside their prior. It is 1 where the noise stays. A prior that is only loosened leaves the misfit of a far change,
+    such as a stretched picture, and that looks like noise.
+    """
+    freed = {*case.station_keys, *case.lens_keys}
+    fit, spare = case.least(used, freed, posed[1].stations[case.name].cam_from_world), used.equations - len(freed)
+    if fit is None or spare < 1 or _noise(used, fit[0], len(freed))[0] > NOISIER:
+        return 1.0
+    ratio = (posed[0] - fit[0]) / len(case.lens_keys) * spare / max(fit[0], np.finfo(float).tiny)
+    return float(np.exp(log_f_tail(ratio, len(case.lens_keys), spare)))
+
+
 def _cause(case: _CheckCase, used: Sights, posed: _Fit) -> tuple[str, Estimate]:
-    """Return what explains the observations at the least price, as in a refit: a movement alone, or another zoom or
-    iris, too; and the estimate with it.
+    """Return what explains the observations at the least price, as in a refit: a movement alone, or another zoom, iris
+    or camera, too; and the estimate with it.
     """
     key = case.sight.key
     pose, lens = posed[1].stations[key.station].cam_from_world, case.estimate.cameras[key.camera].lens
     fits = {"pose": (0, posed)}
-    for what in ("zoom", "iris"):
+    for what in ("zoom", "iris", "everything"):
         freed = loosened(what, key.camera, lens) & set(case.lens_keys)
         fit = case.least(used, {*case.station_keys, *freed}, pose) if freed else None
         if fit is not None:
@@ -345,8 +361,8 @@ def _words(answer: Agreement) -> str:
 
 def _cause_words(answer: Agreement) -> str:
     change = answer.change
-    if change is None or answer.cause == "iris":
-        return WORDS["iris"]
+    if change is None or answer.cause in ("iris", "everything"):
+        return WORDS[answer.cause or "iris"]
     if answer.cause == "zoom":
         return f"{WORDS['zoom']} (phi {change.phi_px[0]:.1f} -> {change.phi_px[1]:.1f} px)"
     return moved_words(1e-3 * change.moved_mm, change.turned_deg, "about ")

@@ -55,7 +55,7 @@ WORDS = {
     "pose": "the lens is unchanged",
     "zoom": "the zoom was changed",
     "iris": "the lens's distortion has changed (another iris or focus)",
-    "everything": "this is another lens or another camera",
+    "everything": "this is another lens or camera, or a picture that was stretched, cropped or turned",
 }
 
 
