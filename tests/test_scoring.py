@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from photos.real_data import ov_plane
-from scenery import board_scene
+from scenery import board_scene, field_scene, overhead_pose
 from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import DegenerateError, InputError
@@ -24,7 +24,7 @@ from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.simulate import Disturbance, Scene, simulate
 
 __all__ = ["say"]
 _CAMERA = scenes.camera("brown")
@@ -103,6 +103,27 @@ def test_the_poses_of_a_rig_are_tested_where_they_are_held() -> None:
     other = replace(known, estimate=moved)
     assert score(other, seen)["east"].misfit.noise[0] == pytest.approx(1.0, abs=0.12)
     assert score(other, seen, hold_stations=True)["east"].misfit.noise[0] > 2.0  # 5
+
+
+def test_a_field_is_scored_by_its_own_noise_and_place() -> None:
+    """By the noise of boards a sound field was "not good"; of a camera that moved, "usable": its rows were outliers."""
+    camera, pose = _CAMERA, overhead_pose(0.3, 0.2, 4.0, tilt_x_deg=8.0)
+    stations = {"camera": Station("camera", pose)}
+    field = field_scene(ssl_field("B"), {"camera": camera}, stations, spacing_m=0.3)
+    boards = board_scene(_BOARD, {"camera": camera}, stations, 6, seed=1)
+
+    def seen(of: Scene, sigma_px: float, seed: int) -> Observations:
+        return simulate(of, Disturbance(points_sigma_px=sigma_px, curves_sigma_px=sigma_px), seed).observations
+
+    known = calibrate(seen(field, 0.3, 1) + seen(boards, 0.15, 1), Options(lens="brown"))
+    answer = score(known, seen(field, 0.3, 2))["camera"]
+    assert answer.holds is not False and answer.misfit.noise[0] > NOISIER, answer.words  # 1.9
+    moved = Pose.looking(pose.position + np.array([0.05, 0.0, 0.0]), pose.rotation)
+    bumped = replace(known.estimate, stations={"camera": Station("camera", moved)})
+    both = seen(field, 0.3, 3) + seen(boards, 0.15, 3)
+    assert score(known, both, hold_stations=True)["camera"].holds
+    answer = score(replace(known, estimate=bumped), both, hold_stations=True)["camera"]
+    assert answer.holds is False and "were taken out" in answer.words, answer.words
 
 
 def test_a_field_alone_leaves_nothing_to_pose_under_held_stations() -> None:

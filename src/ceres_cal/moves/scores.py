@@ -59,7 +59,9 @@ def score(
     priors = gather_priors(observed, given, EXACT)
     posed = solved_from(Task(tested=False, before=layout), start, Problem(sights, layout, priors, options=given))
     left = residuals(sights, posed.estimate)
-    noise = _noise_ratios(posed, calibration)
+    noise = _ratios(posed.fit.noise_px, calibration.fit.noise_px)
+    stated, spare = _ratios(posed.fit.scales, calibration.fit.scales), (_spare(posed), _spare(calibration))
+    in_world = np.array([view.placement is None for view in observed.views])
     views = [(view.camera, _view(number, observed, left, posed, noise)) for number, view in enumerate(observed.views)]
     views.sort(key=lambda one: -one[1].misfit.all_rms_px)
     answers = {}
@@ -67,7 +69,8 @@ def score(
         own = np.array([view.camera == name for view in observed.views])
         misfit = _misfit(own, observed, left, posed, noise)
         its = tuple(view for camera, view in views if camera == name)
-        holds, words = _verdict(misfit, (_spare(posed), _spare(calibration)))
+        parts = (_misfit(own & part, observed, left, posed, noise) for part in (in_world, ~in_world))
+        holds, words = _verdict(max(parts, key=lambda one: one.many_out), misfit, stated, spare)
         answers[name] = Agreement(
             name=name, holds=holds, words=words, misfit=misfit, views=its, pose_free=True, solution=posed
         )
@@ -99,19 +102,27 @@ def _spare(calibration: Calibration) -> tuple[float, float]:
     return points, curves
 
 
-def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool | None, str]:
-    """Return whether a camera predicts the scored observations, and the sentence that says so. `spare`: equations
-    behind the noise of these and of the calibration's observations; where they are few, one is many times the other by
-    chance.
+def _verdict(
+    part: Misfit, misfit: Misfit, stated: tuple[float, float], spare: Sequence[tuple[float, float]]
+) -> tuple[bool | None, str]:
+    """Return whether a camera predicts the scored observations, and the sentence that says so.
+
+    Args:
+        part: the observations of the field or of boards, of which more were taken out. stated: noise over the
+            calibration's, both in stated sigmas: boards may be observed better than fields, so larger px alone are no
+            reason to refuse. spare: equations behind the noise of these and of the calibration's observations; where
+            they are few, one is many times the other by chance.
     """
     noise = max((one for one in misfit.noise if one == one), default=np.nan)
     size = f"to {two_digits(max(misfit.points_rms_px, misfit.curves_rms_px))} px"
-    if misfit.many_out:
-        out = f"{misfit.outliers} of {misfit.count} observations were taken out"
-        return False, f"is not good for these observations: {out}: check labels, target and camera"
+    for one in (misfit, part):
+        if one.many_out:
+            out = f"{one.outliers} of {one.count} observations were taken out"
+            return False, f"is not good for these observations: {out}: check labels, target and camera"
     much = f"{two_digits(noise)} times the noise of its calibration"
-    behind = [one[misfit.noise.index(noise)] for one in spare] if noise > NOISIER else []
-    if behind and log_f_tail(noise**2, *behind) < np.log(FALSE_ALARMS):
+    least = [min(pair) if pair[0] == pair[0] else 0.0 for pair in zip(misfit.noise, stated, strict=True)]
+    kind = int(np.argmax(least))
+    if least[kind] > NOISIER and log_f_tail(least[kind] ** 2, *(one[kind] for one in spare)) < np.log(FALSE_ALARMS):
         why = "the cause may be noisier clicks or pictures, another focus, zoom or target, or too simple a lens"
         return False, f"is not good for these observations: it predicts them {size}, {much}: {why}"
     if np.isnan(noise):
@@ -124,10 +135,9 @@ def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool
 # ---- what is left ---------------------------------------------------------------------------------------------------
 
 
-def _noise_ratios(posed: Calibration, before: Calibration) -> tuple[float, float]:
-    """Return the noise of points and of curves over that of the calibration, px over px; NaN where either has none."""
-    pairs = zip(posed.fit.noise_px, before.fit.noise_px, strict=True)
-    points, curves = (new / old if new > 0.0 and old > 0.0 else float("nan") for new, old in pairs)
+def _ratios(here: tuple[float, float], before: tuple[float, float]) -> tuple[float, float]:
+    """Return the noise of points and of curves over that of the calibration; NaN where either has none."""
+    points, curves = (new / old if new > 0.0 and old > 0.0 else np.nan for new, old in zip(here, before, strict=True))
     return points, curves
 
 
