@@ -400,6 +400,22 @@ def test_mirrored_labels_of_a_field_that_is_nearly_symmetric_are_said(calibratio
         refit(calibration, mirrored)
 
 
+@pytest.mark.parametrize(
+    ("flips", "words"), [((True, True), "picture turned by 180 degrees"), ((True, False), "image is flipped")]
+)
+def test_a_flipped_picture_is_said(flips: tuple[bool, bool], words: str) -> None:
+    """It was another lens, or nothing fitted, "no mirrored labels" either: its middle is not the principal point."""
+    lens = replace(CAMERA, principal_point=(618.0, 497.0))
+    scene = field_scene(FIELD, {"overhead": lens}, {"overhead": Station("overhead", HOME)}, spacing_m=0.3)
+    known = calibrate(simulate(scene, NOISE, 7).observations, Options(lens="radial"))
+    observations = simulate(scene, NOISE, 8).observations
+    points, curves, last = observations.points, observations.curves, np.array([1279.0, 959.0])
+    points = replace(points, pixels=np.where(flips, last - points.pixels, points.pixels))
+    curves = replace(curves, pixels=np.where(flips, last - curves.pixels, curves.pixels))
+    with pytest.raises(SolutionError, match=words):
+        refit(known, replace(observations, points=points, curves=curves))
+
+
 def test_another_field_is_said(calibration: Calibration) -> None:
     stations = {"overhead": Station("overhead", MOVED)}
     scene = field_scene(ssl_field("A"), {"overhead": CAMERA}, stations, spacing_m=0.3)

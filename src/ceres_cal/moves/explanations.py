@@ -16,7 +16,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.agreement import NOISIER, price_nats
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, equations, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitPlan, mistaken_targets
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.posterior import LEAST_PROBABILITY
@@ -42,6 +42,7 @@ _SUPPORTED = 10.0
 # within the second of its old place (m), turned by less than the third (rad). Nothing changes from half to double.
 _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
 _TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+_TURNED = "with the picture turned by 180 degrees they do: turn it back, or calibrate it anew"
 _MIRRORED = "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
 
 _WIDER = {
@@ -142,11 +143,10 @@ def _other_explanation(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solut
 
 def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     """Yield explanations that fit, and fit better than the known lens and field, with what to do."""
-    misfit = f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
-    old = old_poses(plan, search)
+    misfit, old = _does_not_fit(search), old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
-    if _fits_mirrored(search, old, known):
-        yield SolutionError(f"{misfit}{_MIRRORED}")
+    if (flipped := _flipped(search, old, known)) is not None:
+        yield SolutionError(f"{misfit}{flipped}")
     for name, observations in mistaken_targets(search.sight.observations).items():
         if _fits(_seen_as(search, observations), old, known):
             yield SolutionError(f"{misfit}on {name} they do: this is the wrong field: correct the target's dimensions")
@@ -165,9 +165,30 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
         yield SolutionError(f"{misfit}with another lens they do: {WORDS['everything']}: calibrate it anew")
 
 
-def _fits_mirrored(search: PoseSearch, old: list[Pose], known: float) -> bool:
-    mirrored = relabelled(search.sight.observations, MIRRORED)
-    return mirrored is not None and _fits(_seen_as(search, mirrored), old, known)
+def _does_not_fit(search: PoseSearch) -> str:
+    return f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
+
+
+def _flipped(search: PoseSearch, old: list[Pose], known: float) -> str | None:
+    """Return how labels or the picture were flipped, where that explains the observations; else None. A picture is
+    flipped about its middle, which is not the principal point, so flipped labels alone may not explain it.
+    """
+    enough = 12  # equations: a pose has six numbers, and of five noisy clicks a flipped picture explains some by chance
+    observations, last = search.sight.observations, np.array(search.camera.image_size) - 1.0
+    mirrored = relabelled(observations, MIRRORED)
+    every = [] if mirrored is None else [(mirrored, _MIRRORED)]
+    pictures = ((True, True), _TURNED), ((True, False), _MIRRORED), ((False, True), _MIRRORED)
+    for flips, words in pictures if equations(search.sight) >= enough else ():
+        points, curves = (
+            replace(one, pixels=np.where(flips, last - one.pixels, one.pixels))
+            for one in (observations.points, observations.curves)
+        )
+        every.append((replace(observations, points=points, curves=curves), words))
+    found = [(pose_candidates(_seen_as(search, seen), old, patience=0)[:1], words) for seen, words in every]
+    good = [
+        (one.misfit, words) for best, words in found for one in best if _good(one, known) and one.share > 1.0 - _FEW
+    ]
+    return min(good)[1] if good else None
 
 
 def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
@@ -281,6 +302,11 @@ def supported(
     speak_for = [w for w in quiet if w in easily and misfits[w] + let_go[w] <= misfits[plan.what] + let_go[plan.what]]
     rivals = tuple(_rivals({what: scores[what] for what in speak_for}, best, results, solved_with))
     if best != plan.what:
+        for search, solved in zip(searches, _solved_searches(plan, results[best]), strict=True):
+            pose = solved.estimate.stations[search.sight.key.station].cam_from_world
+            freed = candidate_at(solved, pose).misfit + _price(plan, best)
+            if (flipped := _flipped(search, old_poses(plan, search), freed)) is not None:
+                raise SolutionError(f"{_does_not_fit(search)}{flipped}")
         # A noisy explanation may be something else; one with no more noise than what was asked for may have is taken.
         if judged(plan, best, results[best]).noisy and (other := _other_explanation(plan, searches)) is not None:
             raise other
@@ -308,9 +334,10 @@ def _require_unmirrored(plan: RefitPlan, result: Calibration) -> None:
     """
     for search in _solved_searches(plan, result):
         pose = result.estimate.stations[search.sight.key.station].cam_from_world
-        if _fits_mirrored(search, [*old_poses(plan, search), pose], candidate_at(search, pose).misfit):
+        flipped = _flipped(search, [*old_poses(plan, search), pose], candidate_at(search, pose).misfit)
+        if flipped is not None:
             station = search.sight.key.station
-            raise SolutionError(f"station {station!r}: some of its observations do not fit the others; {_MIRRORED}")
+            raise SolutionError(f"station {station!r}: some of its observations do not fit the others; {flipped}")
 
 
 def _rivals(
