@@ -30,7 +30,8 @@ from ceres_cal.report.document import Document, Table
 from ceres_cal.report.grounds import Judgement, judge_quality
 from ceres_cal.report.quality import quality_of
 from ceres_cal.report.summary import calibration_sections
-from ceres_cal.robust.conflicts import _beside, contradicted_by
+from ceres_cal.robust.conflicts import Rest, _beside, contradicted_by, worst_test
+from ceres_cal.robust.stated import Statement, contradicted
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Station, simulate
 from ceres_cal.start.initialise import Start
@@ -496,6 +497,13 @@ def test_of_several_priors_the_worst_is_contradicted_as_rarely_as_one() -> None:
     both = GaussianPrior(Information.of_sigmas(dict.fromkeys(two, 0.01)), np.array([height_m + 0.3, height_m]))
     words = contradicted_by([both], there, Information(two, np.full((2, 2), 1e4)), 1000.0) or ""
     assert re.search(rf"station 'a', .* {height_m:.2f} ± 0.01 m, 21 sigmas apart", words), words
+    # Almost only the sum: one number of an earlier calibration was "520589918 ± 123653026", and to be removed.
+    rest = Rest(there, np.zeros(2), Information(two, 1e4 * np.ones((2, 2)) + 1e-10 * np.diag([1.0, -1.0])), 1000.0)
+    matrix = 1e4 * np.array([[1.0, 0.5], [0.5, 1.0]])
+    earlier = GaussianPrior(Information(two, matrix), np.array([height_m + 0.3, height_m]))
+    one = Statement("earlier", two, (earlier,), np.empty(0))
+    words = contradicted(one, worst_test(one, rest), False, ()).words
+    assert re.search(r"gives \d\.\d+ ± 0\.01\d? m, .* as two stations of one camera", words), words  # 3.67 ± 0.01
 
 
 def test_lenses_are_chosen_from_the_papers_where_priors_gave_no_start(

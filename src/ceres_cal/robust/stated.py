@@ -249,7 +249,11 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
         alone: whether only observations contradict it. rivals: names of other statements that may be wrong instead.
     """
     key, also = test.key, "".join(f", or else {one}" for one in rivals)
-    words = f"{_apart(statement, test, alone)}: {_in_another_unit(test)}correct or remove it{also}"
+    remedy = f"{_in_another_unit(test)}correct or remove it"
+    if statement.kind == "earlier":
+        together = "calibrate the earlier and these observations together, as two stations of one camera"
+        remedy = f"if the lens is the same, {together}; else refit with --what everything"
+    words = f"{_apart(statement, test, alone)}: {remedy}{also}"
     return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
 
 
