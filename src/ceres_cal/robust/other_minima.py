@@ -294,11 +294,12 @@ def seen_alike(
         if elsewhere:
             there = elsewhere[0].position
             first, second = (f"({', '.join(f'{value:.2f}' for value in place)}) m" for place in (here, there))
+            known = "height" if abs(there[2] - here[2]) > far else "rough position (position_m)"
             yield (
                 (
                     f"station {name!r}: its observations fit equally well from {first} and from {second}"
                     f"{', with other places on the floor' if apart else ''}: add a point or a line, or the "
-                    "camera's height as a prior"
+                    f"camera's {known} as a prior"
                 ),
                 bool(apart),
             )
