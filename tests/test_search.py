@@ -16,6 +16,7 @@ from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.checks import check
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Options
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
@@ -24,6 +25,8 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.symmetry import TURNED
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Station, simulate
+from ceres_cal.start.initialise import initialise
+from ceres_cal.start.search import _searched_once
 
 CAMERA = Camera((1280, 960), 700.0, (640.0, 480.0), Radial((-5e-5, 6e-7)))
 KNOWN = Options(lens="radial", fixed={"phi": 700.0, "cx": 640.0, "cy": 480.0, "a2": -5e-5, "a3": 6e-7})
@@ -135,3 +138,15 @@ def test_a_circle_tells_the_height(tilt_deg: float) -> None:
     posterior = calibration.uncertainty.posterior
     assert min(posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y")) > 3.0  # 5 m, or infinite
     assert posterior.sd_of("station", "hall", "height") < 0.02
+
+
+def test_a_search_is_made_once() -> None:
+    """The same question has the same answer, and is not searched again: lenses and other starts ask it repeatedly."""
+    sights = gather_sights(seen(("BottomTouchLine", "TopTouchLine", "CenterCircle")))
+    _searched_once.cache_clear()
+    first, again = (initialise(sights, KNOWN).estimate for _ in range(2))
+    asked = _searched_once.cache_info()
+    assert asked.hits >= asked.misses >= 1
+    assert first.stations == again.stations and first.cameras == again.cameras
+    initialise(gather_sights(seen(("BottomTouchLine", "TopTouchLine", "CenterCircle"), 21.0)), KNOWN)
+    assert _searched_once.cache_info().misses > asked.misses  # other observations are another question

@@ -11,7 +11,8 @@ eight numbers of the homography H. From H follow phi, by r1 . r2 = 0 and |r1| = 
 
 from __future__ import annotations
 
-from functools import cache
+import pickle
+from functools import cache, lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -173,12 +174,25 @@ def costs(lines: Sightlines, poses: Candidates, least_px: float) -> Array:
 def searched(lines: Sightlines, few: Sightlines, proposed: Candidates | None = None) -> BestCameras:
     """The best cameras of the proposed ones, of minimal sets and of a grid.
 
+    A calibration of few clicks asks for the same search four times or more, for lenses, stretched pictures and other
+    starts; it is made once.
+
     Args:
         few: some of the rows, for the first rounds.
     """
+    return _searched_once(pickle.dumps((lines, few, proposed or Candidates.none())))
+
+
+@lru_cache(maxsize=32)
+def _searched_once(asked: bytes) -> BestCameras:
+    """The answer to the pickled arguments of `searched`."""
+    return _searched(*pickle.loads(asked))
+
+
+def _searched(lines: Sightlines, few: Sightlines, proposed: Candidates) -> BestCameras:
     near = 0.02  # rad, and share of the height: nearer candidates are on the way to the same minimum
     first, then = 64, 20  # numbers of candidates that are refined first, and further
-    proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, lines.known.least_px)
+    rough_px = max(_ROUGH_PX, lines.known.least_px)
     some = _drawn(few)
     some = some.take(np.argsort(costs(few, some, 8.0 * rough_px))[:first])
     sets = minimal_sets(few, _logs(few.known, np.geomspace(_PHI_GRID[0], _PHI_GRID[-1], 60)))
