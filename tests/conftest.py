@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, TypeVar
 import pytest
 
 if TYPE_CHECKING:
+    from photos.shots import Shot
+
+    from ceres_cal.calibration import Calibration
     from ceres_cal.detect.boards import BoardDetections
     from ceres_cal.detect.photographs import FieldDetections
 
@@ -119,6 +122,24 @@ def tigers_field(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> t
     from photos.shots import real_detection
 
     return made_once(tmp_path_factory, "tigers", lambda: real_detection(real_data))
+
+
+@pytest.fixture(scope="session")
+def tigers_calibration(
+    tigers_field: tuple[Path, FieldDetections], tmp_path_factory: pytest.TempPathFactory
+) -> Calibration:
+    """The camera that took the real photograph of a field."""
+    from photos.shots import real_calibration
+
+    return made_once(tmp_path_factory, "tigers_calibration", lambda: real_calibration(tigers_field[1]))
+
+
+@pytest.fixture(scope="session")
+def plain_shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    """A photograph of a field in good light, with robots."""
+    from photos.shots import take
+
+    return made_once(tmp_path_factory, "plain_shot", lambda: take(0))
 
 
 @pytest.fixture(scope="session")

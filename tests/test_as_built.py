@@ -165,7 +165,7 @@ def test_a_board_printed_two_percent_longer_is_solved_for(seed: int) -> None:
     assert _off_sd(calibration, "phi", 900.0) < 3.0 and _off_sd(calibration, "aspect", 1.0) < 3.5  # 2.1, 2.5 of sixteen
 
 
-@pytest.mark.parametrize("seed", partly(range(8), [0, 4]))
+@pytest.mark.parametrize("seed", partly(range(8), [0]))
 def test_a_board_by_places_that_is_built_otherwise_is_no_stabilised_camera(seed: int) -> None:
     """Its principal point moved by 5 to 20 px, and phi had an error of 5 standard deviations. The same happened with
     seven views of opencv_extra, whose held-out views are now predicted to 0.082 px instead of 0.095 px.
@@ -175,7 +175,7 @@ def test_a_board_by_places_that_is_built_otherwise_is_no_stabilised_camera(seed:
     assert _off_sd(calibration, "phi", 900.0) < 3.5  # 2.3 measured
 
 
-@pytest.mark.parametrize("seed", partly(range(8), [0, 1, 2]))
+@pytest.mark.parametrize("seed", partly(range(8), [0, 1]))
 def test_what_few_views_do_not_tell_of_a_stretch_widens(seed: int) -> None:
     """The aspect had errors of up to 15 of its standard deviations. Boards as drawn are not noticeably wider."""
     calibration = calibrate(_printed(0.005, 4, seed))

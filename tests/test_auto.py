@@ -211,8 +211,9 @@ def test_a_search_ends_and_says_so(shot: script.Shot, looks: int, monkeypatch: p
     assert result.reason.startswith("the field was not found within 60 s of processor time: check the target's")
 
 
+@pytest.mark.parametrize("by_clicks", partly([False, True], [False]))
 @pytest.mark.parametrize("painted", partly(["A", "B"], ["B"]))
-def test_the_other_division_is_named(painted: str, tmp_path: Path) -> None:
+def test_the_other_division_is_named(painted: str, by_clicks: bool, tmp_path: Path) -> None:
     """If the other division is painted, the message names it, with and without clicks."""
     asked = ssl_field("B" if painted == "A" else "A")
     shot = disturbed.taken("plain", 4, ssl_field(painted))
@@ -222,9 +223,8 @@ def test_the_other_division_is_named(painted: str, tmp_path: Path) -> None:
     names = ("TopLeftCorner", "TopRightCorner", "BottomLeftCorner", "BottomRightCorner")
     x, y = shot.camera.project(np.array([points[name] for name in names])).T.tolist()
     clicks = Clicks(dict(zip(names, zip(x, y, strict=True), strict=True)))
-    for start in (Auto(), clicks):
-        with pytest.raises(NothingShownError, match=f"it shows ssl-{painted.lower()}: give that as the target"):
-            detect_field([path], asked, start)
+    with pytest.raises(NothingShownError, match=f"it shows ssl-{painted.lower()}: give that as the target"):
+        detect_field([path], asked, clicks if by_clicks else Auto())
 
 
 @pytest.mark.parametrize("kind", ["flat", "noise", "board"])

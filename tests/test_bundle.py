@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scenery import field_scene, overhead_pose
 from scenes import SCENES
 from scipy.optimize import least_squares
+from thorough import partly
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
@@ -156,7 +157,7 @@ class DenseSolver:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("name", ["radial-2-3/lines-arcs", "radial-3/corners"])
+@pytest.mark.parametrize("name", partly(["radial-2-3/lines-arcs", "radial-3/corners"], ["radial-2-3/lines-arcs"]))
 def test_robust_optimum_is_scipys(name: str, loss: str) -> None:
     weighting = Weighting(1.1, 0.9, loss, 2.5)
     found = solved(name, weighting)

@@ -378,7 +378,7 @@ def test_one_verdict_on_the_screen_in_json_and_in_the_report(say: Say, tmp_path:
 
 def test_a_wrong_prior_is_said_by_every_command(say: Say, tmp_path: Path) -> None:
     out = tmp_path / "calibration.json"
-    text = say("calibrate", SAMPLE, "-o", out, "--prior", "height_m=3:0.005").out
+    text = say("calibrate", SAMPLE, "--lens", "radial", "-o", out, "--prior", "height_m=3:0.005").out
     assert (
         "warning   the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone give 4.02" in text
     )
@@ -465,7 +465,7 @@ def test_a_prior_names_its_owner_where_there_are_several(say: Say, tmp_path: Pat
     assert "name one station before the dot: left, right" in refused(
         say("calibrate", observations, "--prior", "height_m=4.4:0.01")
     )
-    said = say("calibrate", observations, "--prior", "right.height_m=4.5:0.0001", "--json")
+    said = say("calibrate", observations, "--lens", "radial", "--prior", "right.height_m=4.5:0.0001", "--json")
     height_m = json.loads(said.out)["calibration"]["stations"]["right"]["position_m"][2]
     assert height_m == pytest.approx(4.5, abs=3e-4)  # without the prior it was off by 7e-3
 

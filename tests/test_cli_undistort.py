@@ -24,10 +24,10 @@ __all__ = ["say"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, plain_shot: script.Shot) -> Path:
     """A photograph, the lines detected in it, and calibrations."""
     place = tmp_path_factory.mktemp("undistort")
-    shot = script.take(0)
+    shot = plain_shot
     (place / "in").mkdir()
     cv2.imwrite(str(place / "in" / "shot.png"), shot.picture.image)
     asked = FieldOptions(points=True)  # for the closed form

@@ -168,10 +168,12 @@ def shared_board(square_m: float) -> Observations:
 
 def test_a_board_that_contradicts_the_field_is_named_and_solved_for() -> None:
     """For a rig that sees it together, a moved camera or shifted points were reported."""
-    observations = shared_board(0.099)
-    (found,) = (one for one in diagnose(calibrate(observations), observations).findings if one.kind == "other length")
+    observations, radial = shared_board(0.099), Options(lens="radial")
+    (found,) = (
+        one for one in diagnose(calibrate(observations, radial), observations).findings if one.kind == "other length"
+    )
     assert found.subject == "board/square_m" and re.search(r"is 0\.0990\d ± 0\.000\d+ m, not 0\.1 m", found.sentence)
-    solved = calibrate(observations, Options(dimensions=("board/square_m",)))
+    solved = calibrate(observations, replace(radial, dimensions=("board/square_m",)))
     assert solved.targets["board"].dimensions["square_m"] == pytest.approx(0.099, abs=1e-4)
     assert np.linalg.norm(solved.station("a").position - (-0.5, 0.2, 4.5)) < 0.03  # 0.021, one standard deviation
     for name in ("a", "b"):

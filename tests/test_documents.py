@@ -14,7 +14,7 @@ from data import documents
 
 CODE = re.compile(r"^```(?:console|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 # The others take a minute together, and repeat many commands.
-EACH_TIME = [path for path in DOCUMENTS if path.stem in ("README", "accuracy", "options", "scale")]
+EACH_TIME = [path for path in DOCUMENTS if path.stem in ("README", "accuracy", "scale")]
 INLINE = re.compile(r"`(ceres-cal [^`]+)`")
 
 

@@ -232,8 +232,8 @@ def test_a_target_without_dimensions_has_lines_only() -> None:
 
 
 @pytest.fixture(scope="module")
-def shot() -> script.Shot:
-    return script.take(0)
+def shot(plain_shot: script.Shot) -> script.Shot:
+    return plain_shot
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,9 @@ def alone(pose: Pose, **more: Any) -> Scene:
 # ---- nearness -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("disturbance", [Disturbance(), NOISE], ids=["exact", "noisy"])
+@pytest.mark.parametrize(
+    "disturbance", [pytest.param(Disturbance(), marks=pytest.mark.thorough), NOISE], ids=["exact", "noisy"]
+)
 @pytest.mark.parametrize("name", SCENES)
 def test_starts_are_near_the_truth(name: str, disturbance: Disturbance) -> None:
     """Near enough for the solve, and the initial camera shows all observations.

@@ -22,6 +22,7 @@ from hypothesis.extra import numpy as hnp
 from photos import disturbed as disturbed
 from rendering.moustache import Moustache
 from scenery import board_scene, field_scene, overhead_pose
+from thorough import partly
 
 from ceres_cal.base.arrays import Array, grid_places
 from ceres_cal.base.errors import InputError, SolutionError
@@ -110,7 +111,7 @@ def test_a_lens_that_no_formula_has_in_one_view_of_a_floor() -> None:
     assert np.sqrt(np.mean(off**2)) < 1e-3  # 0.4 mm, of 1.3 stated
 
 
-@pytest.mark.parametrize("seed", [3, 12])  # 2.3, 1.9 times what was stated before, 8 to 22 % of places far beyond
+@pytest.mark.parametrize("seed", partly([3, 12], [3]))  # 2.3, 1.9 times what was stated, many places far beyond
 def test_a_lens_that_no_formula_has_is_stated_where_one_seems_to_fit(seed: int) -> None:
     """Kannala-Brandt's lens moves the camera, and leaves no correlated residuals."""
     rng = np.random.default_rng([7, seed])
@@ -199,8 +200,8 @@ def test_all_that_a_longer_lens_leaves_open_is_in_its_directions() -> None:
 
 @pytest.mark.parametrize("mix", ["boards", "lines-arcs", "field-boards"])
 def test_the_papers_lens_is_recognised(mix: str) -> None:
-    choices = [calibrate(_seen("radial-2-3", mix, seed)).lens_choice for seed in range(5)]
-    assert [choice is not None and choice.chosen == PAPER for choice in choices].count(True) >= 4  # in all of 45
+    choices = [calibrate(_seen("radial-2-3", mix, seed)).lens_choice for seed in range(2)]
+    assert all(choice is not None and choice.chosen == PAPER for choice in choices)  # in all of 45
 
 
 @pytest.mark.parametrize("lens", ["brown", "kannala-brandt", "radial-3-5"])

@@ -160,8 +160,10 @@ def test_it_is_diagnosed_and_reported(calibration: Calibration, simulation: Simu
 
 def test_what_it_lacks_is_said(simulation: Simulation) -> None:
     """Fixed at no distortion, the residuals depend on the radius."""
-    calibration = calibrate(simulation.observations, Options(lens="division", fixed={"k": -1.8e-7}))
-    findings = diagnose(calibration, simulation.observations).findings
+    every = simulation.observations
+    few = every.part(np.ones(len(every.points), dtype=bool), np.arange(len(every.curves)) % 4 == 0)
+    calibration = calibrate(few, Options(lens="division", fixed={"k": -1.8e-7}))
+    findings = diagnose(calibration, few).findings
     radial = [finding for finding in findings if finding.kind == "radius"]
     assert radial and "solve for k" in radial[0].advice
 

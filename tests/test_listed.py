@@ -5,6 +5,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
@@ -140,7 +141,7 @@ def test_boards_that_one_camera_of_a_rig_lists_otherwise_are_named(order: Callab
         return combine([Observations.from_points(px, BOARD, SIZE, camera=name) for name, px in each.items()])
 
     said = f"its points are {words} relative to those of other cameras: list them in the same order"
-    (warning,) = calibrate(rig(lambda number: number == 3)).warnings
+    (warning,) = calibrate(rig(lambda number: number == 3), RADIAL).warnings
     assert "station 'right', placement 'v3'" in warning and said in warning
     with pytest.raises(SolutionError, match=f"station 'right', placement 'v0' and at 11 others: {said}"):
-        calibrate(rig(lambda number: True))
+        calibrate(rig(lambda number: True), RADIAL)

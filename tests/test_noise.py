@@ -12,6 +12,7 @@ import pytest
 from accuracy.diagnostic_scenes import held_boards
 from scenery import field_scene, overhead_pose
 from scenes import RADIAL
+from thorough import partly
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import attempt
@@ -161,11 +162,12 @@ def clicked_beside_boards(seed: int, count: int = 11, noise_px: float = 1.0) -> 
     return of_field + Observations.from_points(shown, board, size), camera
 
 
-def test_clicks_count_by_their_own_noise_beside_detected_boards() -> None:
+@pytest.mark.parametrize("seeds", partly([(0, 1), (2, 3)], [(0, 1)]))
+def test_clicks_count_by_their_own_noise_beside_detected_boards(seeds: tuple[int, ...]) -> None:
     """With the noise of the boards the pose passed through four clicks, the others were outliers, and errors were up to
     6.1 times the 95 % radius.
     """
-    for seed in range(4):
+    for seed in seeds:
         observations, camera = clicked_beside_boards(seed)
         calibration = calibrate(observations)
         assert np.max(radii_of(calibration, camera)) < 2.0, seed  # 1.1
@@ -197,12 +199,12 @@ def test_few_clicks_beside_boards_say_how_little_is_known_of_their_noise(count: 
 @pytest.mark.parametrize("freedom", [2.0, 6.0, 20.0])
 def test_a_scale_of_few_holds_what_it_says(freedom: float) -> None:
     """Over the scales that are assumed to be, 95 % of normal errors are within 1.96 times the scale that is found."""
-    rng, runs = np.random.default_rng(0), 1000
+    rng, runs = np.random.default_rng(0), 400
     scales = np.exp(np.clip(np.log(1.25) * rng.standard_cauchy(runs), -5.0, 5.0))
     squares = scales**2 * rng.chisquare(freedom, runs)
     found = np.array([_scale_of_few(one, freedom) for one in squares.tolist()])
     inside = np.abs(scales * rng.standard_normal(runs)) < NORMAL_95 * found
-    assert np.mean(inside) == pytest.approx(0.95, abs=0.02)  # standard error 0.007
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.02)  # standard error 0.011
 
 
 @pytest.mark.thorough

@@ -20,13 +20,14 @@ from scenes import LENSES, camera, two_cameras
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.images import encoded, read_grey
 from ceres_cal.detect.photographs import FieldDetections
-from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.parameters import Station as Posed
-from ceres_cal.problem.structure import Tolerance, make_structure
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.report.in_photographs import first_of_each
 from ceres_cal.report.pictures.frames import (
     Frame,
@@ -60,9 +61,9 @@ def straight_of(lens: str, whole: bool) -> Straightening:
     return straighten(seen(lens), whole=whole)
 
 
-@pytest.fixture(scope="module")
-def shot() -> script.Shot:
-    return script.take(0)
+@pytest.fixture
+def shot(plain_shot: script.Shot) -> script.Shot:
+    return plain_shot
 
 
 # ---- straight images ------------------------------------------------------------------------------------------------
@@ -291,11 +292,12 @@ def test_the_model_of_a_field_is_where_the_camera_sees_it(shot: script.Shot, tmp
     assert frame_by_name(calibration, frame.station, "any") == Frame("any", frame.station, (("field", None),))
 
 
-def test_the_real_field_s_overlay_lies_on_the_paint(tigers_field: tuple[Path, FieldDetections]) -> None:
+def test_the_real_field_s_overlay_lies_on_the_paint(
+    tigers_field: tuple[Path, FieldDetections], tigers_calibration: Calibration
+) -> None:
     path, found = tigers_field
-    calibration = calibrate(found.observations, Options(lens="radial", tolerances={"field": Tolerance(0.03, 0.03)}))
     (frame,) = frames_of(found.observations)
-    model = model_of(calibration, frame)
+    model = model_of(tigers_calibration, frame)
     grey = read_grey(path).astype(float)
     names = list(script.real_target().curves)
     for name in ("BottomTouchLine", "RightGoalLine", "RightPenaltyStretch", "RightFieldRightPenaltyStretch"):

@@ -58,7 +58,10 @@ def refusal(observations: Observations, options: Options | None = None) -> str:
     return str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["corners", "lines-arcs", "field-boards", "rings-field", "two-cameras"])
+_MIXES = ["corners", "lines-arcs", "rings-field", "two-cameras"]
+
+
+@pytest.mark.parametrize("name", [*_MIXES, pytest.param("field-boards", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("how", MIRRORED)
 def test_a_mirrored_picture_is_refused(name: str, how: str) -> None:
     seen = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
@@ -215,7 +218,7 @@ def test_one_view_under_wrong_labels_is_named_and_costs_no_trust() -> None:
     assert after.station("camera").phi == pytest.approx(before.station("camera").phi, abs=1.0)  # 0.28 px measured
 
 
-@pytest.mark.parametrize("seed", partly((100, 103, 107, 108, 109, 110, 111, 112, 116), (107, 109)))
+@pytest.mark.parametrize("seed", partly((100, 103, 107, 108, 109, 110, 111, 112, 116), (107,)))
 def test_views_under_wrong_labels_decide_no_lens(seed: int) -> None:
     """Three corners of 54 agree with the pose of such a board by chance: with them, a lens that was too short was
     chosen in two of 20 sets, and phi was 3.5 and 4.2 standard deviations off.

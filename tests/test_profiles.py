@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from thorough import partly
 
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.detect.blur import blur_of, no_blur
@@ -37,8 +38,8 @@ def fitted(image: Array, normal: Array, blur: float) -> tuple[float, float]:
     return float(found.offset_px[0]), float(found.sigma_px[0])
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 13.0, 45.0, 77.0, 90.0, 160.0])
-@pytest.mark.parametrize("blur", [0.4, 0.7, 1.3])
+@pytest.mark.parametrize("angle_deg", partly([0.0, 13.0, 45.0, 77.0, 90.0, 160.0], [0.0, 13.0, 77.0, 160.0]))
+@pytest.mark.parametrize("blur", partly([0.4, 0.7, 1.3], [0.4, 1.3]))
 def test_neither_blur_nor_slope_nor_light_pulls(angle_deg: float, blur: float) -> None:
     normal = np.array([np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))])
     for offset in (-0.7, -0.25, 0.0, 0.4):

@@ -355,8 +355,8 @@ def test_numbers_of_others_that_cannot_be(
 
 def test_odd_input_before_every_command(good: Path) -> None:
     """A short run of scripts/fuzz.py."""
-    counts = fuzz.fuzz(good.parent, fuzz.Goal(range(60)), 1)
-    assert sum(counts.values()) == 60
+    counts = fuzz.fuzz(good.parent, fuzz.Goal(range(30)), 1)
+    assert sum(counts.values()) == 30
     assert not counts.failures
 
 
@@ -487,8 +487,8 @@ def test_children_after_a_calibration_in_the_parent(method: str, calibration: Ca
 
 
 def test_threads_that_calibrate_at_once(calibration: Calibration) -> None:
-    with ThreadPoolExecutor(4) as pool:
-        assert len({answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(4)]}) == 1
+    with ThreadPoolExecutor(2) as pool:
+        assert len({answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(2)]}) == 1
 
 
 @pytest.mark.thorough
@@ -569,7 +569,9 @@ def test_names_in_other_encodings(tmp_path: Path) -> None:
     run = program(*rings, env={"LC_ALL": "C", "PYTHONIOENCODING": "ascii"})
     assert run.returncode in (0, 2) and "unexpected" not in run.stderr and "Traceback" not in run.stderr
     named = tmp_path / "kalibrierung-ä.json"
-    run = program("calibrate", SAMPLE, "-o", named, env={"LC_ALL": "C", "PYTHONIOENCODING": "ascii"})
+    run = program(
+        "calibrate", SAMPLE, "--lens", "radial", "-o", named, env={"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
+    )
     assert run.returncode == 0 and named.exists() and "\\xe4" in run.stdout, run
 
 

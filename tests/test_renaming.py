@@ -64,9 +64,11 @@ def test_exchanged_names_are_refused_and_corrected(names: tuple[str, str]) -> No
 
 def test_the_command_corrects_them(say: Say, tmp_path: Path) -> None:
     renamed(left_part(), {"HalfwayLine": "LeftGoalLine", "LeftGoalLine": "HalfwayLine"}).save(tmp_path / "wrong.json")
-    refused = say("calibrate", tmp_path / "wrong.json")
+    refused = say("calibrate", tmp_path / "wrong.json", "--lens", "radial")
     assert refused.code == 2 and "exchange their names" in refused.err
-    said = json.loads(say("calibrate", tmp_path / "wrong.json", "--mend-labels", "--json").out)["calibration"]
+    said = json.loads(say("calibrate", tmp_path / "wrong.json", "--lens", "radial", "--mend-labels", "--json").out)[
+        "calibration"
+    ]
     assert any(one.endswith("exchange their names: renamed") for one in said["remarks"])
     assert not [one for one in said["rejected"] if one["kind"] == "curve" and one["feature"] == "HalfwayLine"][3:]
 

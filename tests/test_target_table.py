@@ -82,6 +82,7 @@ def observed() -> Simulation:
     return simulate(scene, Disturbance(points_sigma_px=0.2, curves_sigma_px=0.2), seed=3)
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_a_kind_of_one_s_own_goes_all_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     observed().observations.save(tmp_path / "observations.json")
     observations = Observations.load(tmp_path / "observations.json")

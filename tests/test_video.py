@@ -220,6 +220,7 @@ def test_a_video_where_photographs_are_needed(tmp_path: Path, capsys: pytest.Cap
         assert f"{path}: not an image but {words}" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_run_names_the_frames_that_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     still = np.asarray(cv2.imread(str(SAMPLE / "photographs" / "0001.jpg")))
     path = write_video(tmp_path / "game.avi", [still, still, still, np.roll(still, 3, axis=1)])

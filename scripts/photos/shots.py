@@ -22,6 +22,7 @@ from scenery import field_scene, overhead_pose
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light
@@ -322,20 +323,27 @@ def real_detection(folder: Path) -> tuple[Path, FieldDetections]:
     return path, detect_field([path], target, Clicks(TIGERS_CLICKS), painted)
 
 
-def real_rows(folder: Path, picture: Path | None, seen: tuple[Path, FieldDetections] | None = None) -> Iterator[Row]:
+def real_calibration(found: FieldDetections) -> Calibration:
+    """The camera that took the real photograph."""
+    tolerances = {"field": Tolerance(lines_m=0.03, points_m=0.03)}
+    return calibrate(found.observations, Options(lens="radial", tolerances=tolerances))
+
+
+def real_rows(
+    folder: Path, picture: Path | None, made: tuple[tuple[Path, FieldDetections], Calibration] | None = None
+) -> Iterator[Row]:
     """A real photograph of a field of unknown size: lines followed, and their residuals with free dimensions.
 
     Args:
-        seen: result of an earlier `real_detection`.
+        made: results of earlier `real_detection` and `real_calibration`.
     """
-    path, found = seen or real_detection(folder)
+    path, found = made[0] if made else real_detection(folder)
     followed = found.found[str(path)]
     lines, names = followed.lines, real_target().curve_names
     for number in np.unique(lines.course.curve):
         share = float(np.mean(lines.found[lines.course.curve == number]))
         yield Row("real photograph", f"share of {names[number]} followed", share, least=0.3)
-    options = Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.03, points_m=0.03)})
-    calibration = calibrate(found.observations, options)
+    calibration = made[1] if made else real_calibration(found)
     yield Row("real photograph", "rms of line residuals, px", calibration.fit.curves_rms_px, most=0.7)
     taken_out = sum(entry.kind == "curve" for entry in calibration.rejected)
     yield Row("real photograph", "line observations taken out", taken_out, note=f"of {len(lines.course)} places")
