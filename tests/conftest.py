@@ -43,6 +43,7 @@ def pytest_collection() -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)  # parsed sources make a million objects, which are no garbage
     gc.enable()
     if "hypothesis" not in sys.modules:  # its plugin would import it at the end
         session.config.pluginmanager.unregister(name="hypothesispytest")

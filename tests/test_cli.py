@@ -409,9 +409,11 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert data["calibration"]["options"] == _plain(Options(lens="radial", terms=("tangential",)))
 
 
-def test_options_arrive(say: Say) -> None:
+def test_options_arrive(say: Say, tmp_path: Path) -> None:
+    every, few = Observations.load(SAMPLE), tmp_path / "few.json"
+    every.part(np.ones(len(every.points), bool), np.arange(len(every.curves)) % 4 == 0).save(few)
     said = say(
-        *("calibrate", SAMPLE, "--json", "--lens", "brown", "--fix", "k3=0", "--fix", "p1=1e-4", "--free-aspect"),
+        *("calibrate", few, "--json", "--lens", "brown", "--fix", "k3=0", "--fix", "p1=1e-4", "--free-aspect"),
         *("--hold-principal-point", "--loss", "cauchy", "--loss-scale", "2", "--reject-sigma", "6", "--threads", "1"),
         *("--noise-scale", "stated", "--max-iterations", "50", "--prior", "height_m=4.02:0.01"),
         *("--prior", "overhead.position_m=-2.27,-0.12,4.02:0.01,0.02,0.03", "--prior", "k1=-0.2:1"),

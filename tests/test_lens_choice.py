@@ -662,7 +662,7 @@ _FEW = {  # clicked corners of a division B field through wide lenses: size, phi
 }
 
 
-@pytest.mark.parametrize("few", _FEW)
+@pytest.mark.parametrize("few", partly(_FEW, ["seven, and the height"]))
 def test_too_few_corners_to_compare_lenses_by_count_other_kinds(few: str) -> None:
     """With only the paper's lens a centre was known to 3 px with an error of 5.5 sd, and places had
     errors of 5 radii.

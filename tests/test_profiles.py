@@ -74,7 +74,7 @@ def test_a_smear_is_found_and_moves_nothing() -> None:
     assert as_gaussian.sigma_px[0] > 2.0 * found.sigma_px[0]  # 3.3
 
 
-@pytest.mark.parametrize("lean", [1.0, -1.0])
+@pytest.mark.parametrize("lean", partly([1.0, -1.0], [-1.0]))
 def test_coma_is_found_and_moves_nothing(lean: float) -> None:
     normal, edges = np.array([0.28, 0.96]), 0.5 * WIDTH_PX * np.array([[-1.0, 1.0]])
     share = np.linspace(0.0, 1.0, 61)

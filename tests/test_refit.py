@@ -362,7 +362,7 @@ def test_another_zoom_is_found_where_the_picture_is_noisier(calibration: Calibra
 
 def test_another_iris_is_found(calibration: Calibration) -> None:
     camera = replace(CAMERA, lens=Radial((-4.0e-5, 6.3e-7)))
-    changed = seen(MOVED, DAY, 3, camera=camera).observations
+    changed = seen(MOVED, DAY, 3, 0.6, camera).observations
     with pytest.raises(SolutionError, match=r"distortion has changed.*--what iris"):
         refit(calibration, changed, "pose")
     result = refit(calibration, changed)

@@ -144,8 +144,8 @@ def test_sizes_are_limited_and_the_limit_can_be_raised(tmp_path: Path, monkeypat
         f"would take 1000000 MB, more than the limit of 512 MB: give less at a time, or set {LIMIT}",
     )
     small = tmp_path / "small.json"
-    small.write_bytes(b"[" + b"[]," * 1_000_000 + b"[]]")
-    monkeypatch.setenv(LIMIT, "100")
+    small.write_bytes(b"[" + b"[]," * 100_000 + b"[]]")
+    monkeypatch.setenv(LIMIT, "10")
     refused(Observations.load, small, f"set {LIMIT}=")
     monkeypatch.setenv(LIMIT, "1000")
     refused(Observations.load, small, '"format" must be')
@@ -166,10 +166,10 @@ def repacked(archive: Path, place: Path, columns: dict[str, bytes], twice: str =
 def test_an_archive_that_unpacks_to_gigabytes(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unknown columns are not read, known ones only within the limit, and not more than the archive contains."""
     archive, path = good / "observations.npz", tmp_path / "bomb.npz"
-    zeros = bytes(200_000_000)
+    zeros = bytes(20_000_000)
     refused(Observations.load, repacked(archive, path, {"more.npy": zeros}), "unknown column 'more'")
-    monkeypatch.setenv(LIMIT, "100")
-    refused(Observations.load, repacked(archive, path, {"points_view.npy": zeros}), "would take 200 MB")
+    monkeypatch.setenv(LIMIT, "10")
+    refused(Observations.load, repacked(archive, path, {"points_view.npy": zeros}), "would take 20 MB")
     refused(Observations.load, repacked(archive, path, {}, "points_view.npy"), "a column is there twice")
     text = b"{'descr': '<i4', 'fortran_order': False, 'shape': (100000000000,), }"
     claims = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + text.ljust(117) + b"\n" + bytes(40)

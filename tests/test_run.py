@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ceres_cal import detect_board, run
+from ceres_cal.base.arrays import AnyArray
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.images import each_camera
 from ceres_cal.calibration import Calibration
@@ -24,6 +25,11 @@ SAMPLE = Path(__file__).resolve().parents[1] / "data" / "ssl_field"
 PHOTOGRAPH = str(SAMPLE / "photographs" / "0001.jpg")
 CHARUCO = '{"kind": "charuco", "columns": 9, "rows": 6, "square_m": 0.04, "marker_m": 0.03}'
 FIELD = ("--target", "ssl-b", "--facing", "LeftGoalLine=top")
+
+
+def half_size(path: Path | str) -> AnyArray:
+    """A photograph of 640 x 480 px, in which a field or board is found in less time."""
+    return np.asarray(cv2.resize(np.asarray(cv2.imread(str(path))), (640, 480), interpolation=cv2.INTER_AREA))
 
 
 @pytest.fixture(scope="module")
@@ -147,8 +153,8 @@ def test_a_folder_of_cameras(
     """
     cameras, out = tmp_path / "cameras", tmp_path / "out"
     (cameras / "left").mkdir(parents=True)
-    shutil.copy(PHOTOGRAPH, cameras / "left")
-    image = np.asarray(cv2.imread(PHOTOGRAPH))
+    image = half_size(PHOTOGRAPH)
+    cv2.imwrite(str(cameras / "left" / "0001.jpg"), image)
     video = cv2.VideoWriter(str(cameras / "right.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, image.shape[1::-1])
     for _ in range(3):
         video.write(np.ascontiguousarray(image[::-1, ::-1]))
@@ -198,7 +204,7 @@ def test_two_folders_of_one_camera(tmp_path: Path, capsys: pytest.CaptureFixture
     asked = ["run", "--target", "ssl-b", "--facing", "LeftGoalLine=top", "--board", "9x6x100mm", "--lens", "radial"]
     for name, folder in (("0001", "field"), ("board_01", "boards"), ("board_02", "boards")):
         (tmp_path / folder).mkdir(exist_ok=True)
-        shutil.copy(SAMPLE / "photographs" / f"{name}.jpg", tmp_path / folder)
+        cv2.imwrite(str(tmp_path / folder / f"{name}.jpg"), half_size(SAMPLE / "photographs" / f"{name}.jpg"))
     asked = [*asked, str(tmp_path / "field"), str(tmp_path / "boards"), "--quiet", "-o", str(tmp_path / "out")]
     assert main(asked) == 2
     assert "'boards' shows boards alone and 'field' the field alone" in capsys.readouterr().err

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from accuracy.as_built import Board, observed
 from scenery import field_scene, overhead_pose
+from thorough import partly
 
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.calibration import Calibration
@@ -128,7 +129,7 @@ def test_too_few_stay_too_few() -> None:
     assert np.isinf([posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y", "height")]).all()
 
 
-@pytest.mark.parametrize("tilt_deg", [3.0, 20.0])
+@pytest.mark.parametrize("tilt_deg", partly([3.0, 20.0], [3.0]))
 def test_a_circle_tells_the_height(tilt_deg: float) -> None:
     """It does not determine the direction: the camera is above the floor, and its x and y are unknown."""
     calibration = calibrate(seen(("CenterCircle",), tilt_deg), KNOWN)

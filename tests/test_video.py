@@ -222,7 +222,7 @@ def test_a_video_where_photographs_are_needed(tmp_path: Path, capsys: pytest.Cap
 
 @pytest.mark.usefixtures("words_alone")
 def test_run_names_the_frames_that_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    still = np.asarray(cv2.imread(str(SAMPLE / "photographs" / "0001.jpg")))
+    still = np.asarray(cv2.imread(str(SAMPLE / "photographs" / "0001.jpg"), cv2.IMREAD_REDUCED_COLOR_2))
     path = write_video(tmp_path / "game.avi", [still, still, still, np.roll(still, 3, axis=1)])
     asked = ["--target", "ssl-b", "--facing", "LeftGoalLine=top", "--prior", "height_m=4.02:0.01", "--lens", "radial"]
     assert main(["run", str(path), *asked, "-o", str(tmp_path / "out")]) == 0
