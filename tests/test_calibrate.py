@@ -14,6 +14,7 @@ import pytest
 from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 from scenes import RADIAL, SCENES
 from scipy.optimize import least_squares
+from thorough import partly
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
@@ -343,7 +344,13 @@ def transformed(target: Target, pose: Pose, unit: float) -> Target:
     return custom({name: place(xyz) for name, xyz in target.points.items()}, curves)
 
 
-@pytest.mark.parametrize("name", ["radial-2-3/poles", "radial-2-3/corners", "brown/lines-arcs", "kannala-brandt/lines"])
+@pytest.mark.parametrize(
+    "name",
+    partly(
+        ["radial-2-3/poles", "radial-2-3/corners", "brown/lines-arcs", "kannala-brandt/lines"],
+        ["radial-2-3/poles", "kannala-brandt/lines"],
+    ),
+)
 @pytest.mark.parametrize(
     "turn, shift, unit",
     [
@@ -517,8 +524,10 @@ def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
     [
         ({"fixed": {"phi": 860.0}}, {"phi": 860.0}),
         ({"fixed": {"a3": 6e-7, "cx": 650.0}}, {"a3": 6e-7, "cx": 650.0}),
-        ({"fixed": {"aspect": 1.001}}, {"aspect": 1.001}),
-        ({"free_principal_point": False}, {"cx": 639.5, "cy": 479.5, "aspect": 1.0}),
+        pytest.param({"fixed": {"aspect": 1.001}}, {"aspect": 1.001}, marks=pytest.mark.thorough),
+        pytest.param(
+            {"free_principal_point": False}, {"cx": 639.5, "cy": 479.5, "aspect": 1.0}, marks=pytest.mark.thorough
+        ),
         ({"free_principal_point": False, "fixed": {"cy": 470.0}}, {"cx": 639.5, "cy": 470.0}),
         ({}, {"aspect": 1.0}),
     ],

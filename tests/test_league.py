@@ -25,7 +25,9 @@ def test_each_value_is_tried() -> None:
     assert [set(values) for values in zip(*SOME, strict=True)] == [set(values) for values in zip(*SET_UPS, strict=True)]
 
 
-@pytest.mark.parametrize("set_up", partly(SOME, [one for one in SOME if one.lens != "brown" or one.boards]), ids=str)
+@pytest.mark.parametrize(
+    "set_up", partly(SOME, [one for one in SOME if one.cameras < 4 and (one.lens != "brown" or one.boards)]), ids=str
+)
 def test_an_answer_or_one_honest_line(set_up: SetUp) -> None:
     """No traceback, no warning of NumPy, no "known" number with an error over 5 sd or wider than it was stated. The
     limit of five seconds is tested by the script, since tests share their processors.

@@ -62,7 +62,7 @@ def off_in_sd(calibration: Calibration) -> float:
     "features",
     [
         ("BottomTouchLine", "TopTouchLine", "CenterCircle"),
-        ("BottomTouchLine", "RightGoalLine", "CenterCircle"),
+        pytest.param(("BottomTouchLine", "RightGoalLine", "CenterCircle"), marks=pytest.mark.thorough),
         ("RightGoalLine", "CenterCircle", "BottomRightCorner"),
         ("CenterCircle", "BottomRightCorner"),
     ],
