@@ -295,7 +295,7 @@ def test_from_photographs_alone_to_a_calibration(
 @pytest.mark.parametrize(
     "kind, seed",
     [
-        ("boundary", 100),  # twice as bright as the touch line, 7 px beside it
+        pytest.param("boundary", 100, marks=pytest.mark.thorough),  # twice as bright as the touch line, 7 px beside it
         ("another sport", 0),  # 46 % of the strokes are lines of the field
         ("an old field", 4),
     ],

@@ -257,7 +257,7 @@ def test_either_sign_is_looked_for_where_both_have_strokes() -> None:
     assert [dark for dark, _ in _signs(light, is_near=True)] == [False]
 
 
-@pytest.mark.parametrize("shape", [disturbed.drawn_out, disturbed.comatic])
+@pytest.mark.parametrize("shape", partly([disturbed.drawn_out, disturbed.comatic], [disturbed.comatic]))
 def test_coma_moves_no_line(shot: script.Shot, shape: Callable[[], tuple[Array, Array]]) -> None:
     """The mean of the light defines the line; a symmetric profile displaces it by 0.6 px inwards at the rim."""
     drawn_out = disturbed.with_coma(shot.picture.image, shot.camera, 9.0, shape())

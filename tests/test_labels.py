@@ -46,7 +46,7 @@ def renamed(observations: Observations, kind: str, names: dict[str, str]) -> Obs
     "kind, first, second",
     [
         ("curve", "HalfwayLine", "CenterLine"),
-        ("curve", "BottomTouchLine", "RightGoalLine"),
+        pytest.param("curve", "BottomTouchLine", "RightGoalLine", marks=pytest.mark.thorough),
         ("point", "CenterMark", "TopRightCorner"),
         ("curve", "LeftFieldRightPenaltyStretch", "RightFieldLeftPenaltyStretch"),  # on one line
         ("curve", "LeftFieldLeftPenaltyStretch", "RightFieldLeftPenaltyStretch"),  # each taken out as a whole

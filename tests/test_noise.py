@@ -162,7 +162,7 @@ def clicked_beside_boards(seed: int, count: int = 11, noise_px: float = 1.0) -> 
     return of_field + Observations.from_points(shown, board, size), camera
 
 
-@pytest.mark.parametrize("seeds", partly([(0, 1), (2, 3)], [(0, 1)]))
+@pytest.mark.parametrize("seeds", partly([(0,), (1, 2, 3)], [(0,)]))
 def test_clicks_count_by_their_own_noise_beside_detected_boards(seeds: tuple[int, ...]) -> None:
     """With the noise of the boards the pose passed through four clicks, the others were outliers, and errors were up to
     6.1 times the 95 % radius.

@@ -16,6 +16,7 @@ import pytest
 from chromium import Browser, browser
 from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
+from thorough import partly
 
 from ceres_cal import Calibration, Observations, Options, Pose, Prior, calibrate, write_report
 from ceres_cal.base.errors import InputError, SolutionError
@@ -602,7 +603,9 @@ def crowded_page() -> str:
 
 
 @pytest.mark.parametrize("width", [1280, 400])
-@pytest.mark.parametrize("name", ["sample", "frontal", "two-cameras", "stations"])
+@pytest.mark.parametrize(
+    "name", partly(["sample", "frontal", "two-cameras", "stations"], ["sample", "frontal", "stations"])
+)
 def test_nothing_is_cut_off_and_nothing_complains(window: Browser, tmp_path: Path, name: str, width: int) -> None:
     if name == "sample":
         page = sample_page()
