@@ -15,17 +15,9 @@ from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Windows
 from ceres_cal.kernels import normal_cdf
 
-_STEP_PX, _STEPS = 0.5, 12  # steps in which the mean profile of a line is taken, and their number to either side
-_AWAY_PX: Array = np.arange(0.5, _STEPS) * _STEP_PX
-_TINY = 1e-12
-# Fewest windows of a line, whose scatter tells how well their mean is known; and fewest that reach a step.
-_WINDOWS, _REACHING = 8, 5
-# Largest chi-square per degree of freedom of a line beside which nothing lies: its 99.9 % quantile. Of 260 lines
-# in 20 pictures without seams 4 have more.
-_BY_CHANCE = 3.1
-# What lies on one side leaves as much that is odd as that is even. With less than this share the model lacks a shape
-# that both sides have: 0.33 for overexposed paint, most often 0.5 to 1.7 for seams.
-_ONE_SIDED = 0.45
+# Distances from a line's middle at which its mean profile is taken, and the step between them.
+_AWAY_PX = np.linspace(0.25, 5.75, 12)
+_STEP_PX = float(_AWAY_PX[1] - _AWAY_PX[0])
 
 
 def drawn_together(
@@ -41,12 +33,13 @@ def drawn_together(
         half_px: (N,) half of the paint's width.
         blur_px: (N,) standard deviation of the blur.
     """
+    fewest = 8  # windows of a line, whose scatter tells how well their mean is known
     found, sigma = np.flatnonzero(np.isfinite(middle_px)), np.zeros(len(course))
     left = _left(windows.take(found), middle_px[found], half_px[found], blur_px[found])
     for number in distinct(course.curve[found]):
         own = course.curve[found] == number
         rows = found[own]
-        if len(rows) >= _WINDOWS:
+        if len(rows) >= fewest:
             bright, half, blur = (float(np.mean(one[rows])) for one in (contrast, half_px, blur_px))
             to_px = blur * np.sqrt(2.0 * np.pi) / bright
             sigma[rows] = to_px * _shift(left[own], bright, half, blur) * np.sqrt(len(rows))
@@ -59,22 +52,27 @@ def _left(windows: Windows, middle_px: Array, half_px: Array, blur_px: Array) ->
     edges = (normal_cdf((away + sign * half_px[:, None]) / blur_px[:, None]) for sign in (1.0, -1.0))
     columns = np.stack([np.ones_like(away), away, *edges], axis=2)
     turned = np.swapaxes(columns, 1, 2)
-    normal = turned @ columns + _TINY * np.eye(4)
+    normal = turned @ columns + 1e-6 * np.eye(4)  # negligible beside the number of pixels
     left = windows.values - (columns @ np.linalg.solve(normal, turned @ windows.values[..., None]))[..., 0]
     step = np.floor(np.abs(away) / _STEP_PX).astype(np.intp)
-    near = step < _STEPS
-    index = (2 * (np.arange(len(away))[:, None] * _STEPS + step) + (away > 0.0))[near]
-    count, total = (np.bincount(index, one, 2 * _STEPS * len(away)) for one in (None, left[near]))
+    near = step < len(_AWAY_PX)
+    index = (2 * (np.arange(len(away))[:, None] * len(_AWAY_PX) + step) + (away > 0.0))[near]
+    count, total = (np.bincount(index, one, 2 * len(_AWAY_PX) * len(away)) for one in (None, left[near]))
     with np.errstate(invalid="ignore"):
-        return np.asarray((total / count).reshape(-1, _STEPS, 2))
+        return np.asarray((total / count).reshape(-1, len(_AWAY_PX), 2))
 
 
 def _shift(left: Array, contrast: float, half_px: float, blur_px: float) -> float:
     """Return the standard deviation of the shift, as a multiple of the last column of `_allowed`, that stripes beside a
     line make the profile model find, from what it leaves of the line's windows (M, S, 2).
     """
+    # `chance`: the 99.9 % quantile of chi-square per degree of freedom where nothing lies beside a line; 4 of 260 lines
+    # in 20 pictures without seams have more. `one_sided`: what lies on one side leaves as much that is odd as that is
+    # even. With less than this share the model lacks a shape that both sides have: 0.33 for overexposed paint, most
+    # often 0.5 to 1.7 for seams. `usual`: standard deviation of a stripe's brightness, of the paint's.
+    fewest, chance, one_sided, usual, tiny = 5, 3.1, 0.45, 0.35, 1e-12
     count = np.count_nonzero(np.isfinite(left), axis=0)
-    reach = np.all(count >= _REACHING, axis=1)
+    reach = np.all(count >= fewest, axis=1)
     away = _AWAY_PX[reach]
     allowed = _allowed(away, half_px, blur_px)
     free = len(away) - allowed.shape[1] - 1
@@ -84,7 +82,7 @@ def _shift(left: Array, contrast: float, half_px: float, blur_px: float) -> floa
     sides = np.nansum(left, axis=0) / count
     scatter = 0.25 * np.sum(np.nansum((left - sides) ** 2, axis=0) / count**2, axis=1)
     mean, even = 0.5 * (sides[:, 1] - sides[:, 0]), 0.5 * (sides[:, 1] + sides[:, 0])
-    root = 1.0 / np.sqrt(scatter + _TINY)
+    root = 1.0 / np.sqrt(scatter + tiny)
     values, columns = mean * root, allowed * root[:, None]
     places = np.arange(_STEP_PX, away[-1] + 1.0, 0.5 * _STEP_PX)
     widths = (blur_px, np.hypot(blur_px, 1.0))  # of a stripe much narrower than a pixel, and of one of 3 px
@@ -93,9 +91,9 @@ def _shift(left: Array, contrast: float, half_px: float, blur_px: float) -> floa
     taken_up = np.linalg.lstsq(columns, both, rcond=None)[0]
     beyond = both - columns @ taken_up
     chi_square = float(beyond[:, 0] @ beyond[:, 0])
-    if chi_square < _BY_CHANCE * (free + 1) or mean @ mean < _ONE_SIDED**2 * (even @ even):
+    if chi_square < chance * (free + 1) or mean @ mean < one_sided**2 * (even @ even):
         return 0.0
-    squares = np.sum(beyond[:, 1:] ** 2, axis=0) + (0.35 * contrast) ** -2
+    squares = np.sum(beyond[:, 1:] ** 2, axis=0) + (usual * contrast) ** -2
     brightness = beyond[:, 1:].T @ beyond[:, 0] / squares
     misfit = chi_square - brightness**2 * squares
     weight = np.exp(-0.5 * (misfit - np.min(misfit)) / max(float(np.min(misfit)) / free, 1.0))

@@ -50,9 +50,6 @@ _FAR, _FAR_PX = 5.0, 0.25
 # Largest distance from the neighbours, in units of their own spread. Half of it loses 0.2 % of the line centres, double
 # adds 0.2 %.
 _WANDERING = 4.0
-# Largest common displacement of a line's places, in their own standard deviations: places are treated as independent,
-# so a larger one would take away what the line says about direction and lens, too. 3 and 5 are as good.
-_MOST_TOGETHER = 4.0
 # Step between the places whose scatter is measured: on a nearly horizontal line errors depend on its position within
 # the pixel, and are alike over shorter distances. And the candidates for additional scatter, px.
 _APART = 3
@@ -217,8 +214,11 @@ def measure(
     offset = np.where(found, offset, np.nan)
     if coma is None and not np.any(blur.smear_px):  # coma is asymmetric, too, and has a standard deviation of its own
         middle, half = np.where(found, fits.offset_px, np.nan), 0.5 * blur.stretch * course.width_px
+        # Largest common displacement, in standard deviations of the places. They are treated as independent: a larger
+        # one would take away what a line says about direction and lens, too. 3 and 5 are as good.
+        most = 4.0
         together = drawn_together(windows, course, middle, contrast, half, blur.blur_px)
-        sigma = np.hypot(sigma, np.minimum(together, _MOST_TOGETHER * sigma))
+        sigma = np.hypot(sigma, np.minimum(together, most * sigma))
     return Lines(course, found, offset, sigma, blur.usual_px, blur.stretch, coma_px)
 
 

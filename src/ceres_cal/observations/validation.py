@@ -38,8 +38,6 @@ _LARGE_M = 200.0
 # Distance from the origin of a target's coordinates, m, beyond which digits are lost: one in eight solves over a
 # parking lot does not converge at this distance, none at a tenth of it, three in eight at ten times as far.
 _REMOTE_M = 1e5
-# A row of a view that is farther than so many standard deviations from the one before shows that the view has moved.
-_SURELY_MOVED = 4.0
 # Largest ratio of the sigmas: from ten pixels for a click to a thousandth of a pixel for a large target in the image.
 # Beyond it one observation decides alone, and nothing contradicts it.
 _SIGMA_RATIO = 1e4
@@ -312,6 +310,7 @@ def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
 
 def _still(columns: tuple[Columns, Columns], place: Indices) -> dict[int, int]:
     """Return views that show what an earlier view of the same station and target shows, by the number of that view."""
+    moved = 4.0  # standard deviations between two views' rows from which on the second surely shows another place
     views = np.arange(len(place))
     order = np.lexsort((views, place))
     before: Indices = np.full(len(place), -1, dtype=np.int64)
@@ -322,9 +321,7 @@ def _still(columns: tuple[Columns, Columns], place: Indices) -> dict[int, int]:
         pairs = views[(before >= 0) & (ends[1:] > ends[:-1]) & (ends[before + 1] > ends[before])]
         for row, other in ((ends[pairs], ends[before[pairs]]), (ends[pairs + 1] - 1, ends[before[pairs] + 1] - 1)):
             far_px = np.abs(column.pixels[row] - column.pixels[other]).max(axis=1, initial=0.0)
-            near[pairs] |= (far_px < _SURELY_MOVED * column.sigma_px[row]) & (
-                column.feature[row] == column.feature[other]
-            )
+            near[pairs] |= (far_px < moved * column.sigma_px[row]) & (column.feature[row] == column.feature[other])
     first: dict[int, int] = {}
     for view in np.flatnonzero(near).tolist():
         earlier = first.get(int(before[view]), int(before[view]))
