@@ -160,6 +160,8 @@ def test_what_differs_by_far_less_than_the_noise_counts_once() -> None:
     for differs_px, counts in ((1e-9, False), (0.2, False), (0.3, False), (1.0, True)):
         other = PIXELS + differs_px * rng.standard_normal(PIXELS.shape)
         assert sources(views, points_of(PIXELS, other)) == [-1] * 6 + [-1 if counts else 0] * 6
+    fixed = [replace(view, placement=None) for view in views]  # a field, which is in the same place each time
+    assert sources(fixed, points_of(PIXELS, PIXELS + 0.1)) == [-1] * 12
     most = points_of(PIXELS, PIXELS[1:] + 0.1)  # one corner of six was not found again
     most = replace(most, feature=np.concatenate([np.arange(6), np.arange(1, 6)]))
     assert sources(views, most) == [-1] * 6 + [0] * 5

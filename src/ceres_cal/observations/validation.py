@@ -10,8 +10,9 @@ standard deviation. Copies are found bit for bit: a row that repeats a row of th
 repeats an earlier view of the same target from the same station. A single row that is repeated in another frame is no
 copy: a static camera and a detector of whole pixels may well produce it.
 
-A board that is held still in a video, or clicks that are given again, hardly differ from frame to frame either: far
-less than the noise that is stated. So most of the noise is the same in these frames, and they count once, too.
+A board that is held still in a video hardly differs from frame to frame either: far less than the noise that is stated.
+So most of the noise is the same in these frames, and they count once, too. Frames of a field are not looked at: a fixed
+camera sees it in the same place each time, and if no noise was stated, 1 px may be far more than it is.
 """
 
 from __future__ import annotations
@@ -267,7 +268,7 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
     """
     columns: tuple[Columns, Columns] = (points, curves)
     place = numbers_of((view.station, view.target, view.placement is None) for view in views)
-    still = _still(columns, place)
+    still = _still(columns, place, np.array([view.placement is not None for view in views], dtype=bool))
     if not any(_may_repeat(column, place) for column in columns) and not still:
         none = [np.broadcast_to(np.int64(-1), len(column)) for column in columns]
         return Copies(none[0], none[1])
@@ -308,8 +309,10 @@ def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
     return block.view[starts].astype(np.int64), sums, bool(np.any(hashes[1:] == hashes[:-1]))
 
 
-def _still(columns: tuple[Columns, Columns], place: Indices) -> dict[int, int]:
-    """Return views that show what an earlier view of the same station and target shows, by the number of that view."""
+def _still(columns: tuple[Columns, Columns], place: Indices, moves: Mask) -> dict[int, int]:
+    """Return views of boards, those that `moves` (V,) marks, that show what an earlier view of the same station and
+    target shows, by the number of that view.
+    """
     moved = 4.0  # standard deviations between two views' rows from which on the second surely shows another place
     views = np.arange(len(place))
     order = np.lexsort((views, place))
@@ -318,7 +321,7 @@ def _still(columns: tuple[Columns, Columns], place: Indices) -> dict[int, int]:
     near = np.zeros(len(place), dtype=bool)
     for column in columns:  # a look at one row of each view tells for most that they differ
         ends = np.searchsorted(column.view, np.arange(len(place) + 1))
-        pairs = views[(before >= 0) & (ends[1:] > ends[:-1]) & (ends[before + 1] > ends[before])]
+        pairs = views[moves & (before >= 0) & (ends[1:] > ends[:-1]) & (ends[before + 1] > ends[before])]
         for row, other in ((ends[pairs], ends[before[pairs]]), (ends[pairs + 1] - 1, ends[before[pairs] + 1] - 1)):
             far_px = np.abs(column.pixels[row] - column.pixels[other]).max(axis=1, initial=0.0)
             near[pairs] |= (far_px < moved * column.sigma_px[row]) & (column.feature[row] == column.feature[other])
