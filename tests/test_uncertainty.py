@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -36,13 +37,14 @@ from ceres_cal.posterior import maps
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.bent import valley
 from ceres_cal.posterior.maps import (
+    Functional,
     locate_slopes,
     located_by,
     read,
     spread_of_points,
     visible_pixels,
 )
-from ceres_cal.posterior.mixture import Reading, moments, quantiles, radii
+from ceres_cal.posterior.mixture import Mixture, Reading, moments, quantiles, radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
@@ -619,6 +621,23 @@ def test_a_seam_is_made_of_the_maps_that_were_computed(monkeypatch: pytest.Monke
     seam = known.seam_sd_mm("left", "right")
     assert made == [calibration.estimate.stations[name].camera for name in ("left", "right")]
     assert seam.sd_mm == pytest.approx(np.hypot(left.sd_mm, right.sd_mm), nan_ok=True)
+
+
+@pytest.mark.parametrize(("share", "is_known"), [(0.001, True), (0.01, False)])
+def test_what_a_thousandth_does_not_show_is_known(share: float, is_known: bool) -> None:
+    """One thousandth of what phi may be did not show the field's corners, so "places on the floor are not known"."""
+    _, calibration = seen_twice()
+    here, posterior = calibration.estimate, calibration.uncertainty.posterior
+    information = posterior.normal
+    steps = np.zeros((2, len(information.keys)))
+    steps[1, 0] = 1e-9
+    mixture = Mixture(information.keys, np.array([1.0 - share, share]), steps, (information,), np.zeros(2, np.int64))
+    shown = Functional(
+        lambda there: np.full((1, 2), 0.0 if there is here else np.nan),
+        lambda there, keys: np.full((1, 2, len(keys)), 1.0 if there is here else np.nan),
+    )
+    own: Any = SimpleNamespace(mixture=lambda camera: mixture, half_width=1.96, lenses=())
+    assert np.isfinite(read(own, here, shown).radius_95).all() == is_known
 
 
 @pytest.mark.thorough
