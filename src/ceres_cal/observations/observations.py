@@ -200,7 +200,7 @@ class Observations(Content):
 
     @cached_property
     def copies(self) -> Copies:
-        """Which observations repeat others to the last bit; these count once."""
+        """Which observations repeat others, to the last bit or, of a board held still, far within the noise."""
         return find_copies(self.views, self.points, self.curves)
 
     @cached_property

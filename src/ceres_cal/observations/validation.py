@@ -267,8 +267,10 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
     themselves are compared.
     """
     columns: tuple[Columns, Columns] = (points, curves)
+    least_rows = 4  # least number of rows of a copied view: fewer whole pixels agree by chance
     place = numbers_of((view.station, view.target, view.placement is None) for view in views)
-    still = _still(columns, place, np.array([view.placement is not None for view in views], dtype=bool))
+    boards = np.array([view.placement is not None for view in views], dtype=bool)
+    still = _still(columns, place, boards, least_rows)
     if not any(_may_repeat(column, place) for column in columns) and not still:
         none = [np.broadcast_to(np.int64(-1), len(column)) for column in columns]
         return Copies(none[0], none[1])
@@ -277,7 +279,7 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
     frame = numbers_of((view.frame, number) for view, number in zip(views, place, strict=True))
     for column, own, source in zip(columns, hashes, sources, strict=True):
         _mark_rows(column, own, frame, source)
-    _mark_views(columns, hashes, place, sources)
+    _mark_views(columns, hashes, place, sources, least_rows)
     for view, first in still.items():
         for column, source in zip(columns, sources, strict=True):
             rows = source[_rows_of(column, view)]
@@ -309,9 +311,9 @@ def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
     return block.view[starts].astype(np.int64), sums, bool(np.any(hashes[1:] == hashes[:-1]))
 
 
-def _still(columns: tuple[Columns, Columns], place: Indices, moves: Mask) -> dict[int, int]:
-    """Return views of boards, those that `moves` (V,) marks, that show what an earlier view of the same station and
-    target shows, by the number of that view.
+def _still(columns: tuple[Columns, Columns], place: Indices, boards: Mask, least_rows: int) -> dict[int, int]:
+    """Return views among `boards` (V,) that show what an earlier view of the same station and target shows, by the
+    number of that view.
     """
     moved = 4.0  # standard deviations between two views' rows from which on the second surely shows another place
     views = np.arange(len(place))
@@ -321,21 +323,20 @@ def _still(columns: tuple[Columns, Columns], place: Indices, moves: Mask) -> dic
     near = np.zeros(len(place), dtype=bool)
     for column in columns:  # a look at one row of each view tells for most that they differ
         ends = np.searchsorted(column.view, np.arange(len(place) + 1))
-        pairs = views[moves & (before >= 0) & (ends[1:] > ends[:-1]) & (ends[before + 1] > ends[before])]
+        pairs = views[boards & (before >= 0) & (ends[1:] > ends[:-1]) & (ends[before + 1] > ends[before])]
         for row, other in ((ends[pairs], ends[before[pairs]]), (ends[pairs + 1] - 1, ends[before[pairs] + 1] - 1)):
             far_px = np.abs(column.pixels[row] - column.pixels[other]).max(axis=1, initial=0.0)
             near[pairs] |= (far_px < moved * column.sigma_px[row]) & (column.feature[row] == column.feature[other])
     first: dict[int, int] = {}
     for view in np.flatnonzero(near).tolist():
         earlier = first.get(int(before[view]), int(before[view]))
-        if _shows_the_same(columns, view, earlier):
+        if _shows_the_same(columns, view, earlier, least_rows):
             first[view] = earlier
     return first
 
 
-def _shows_the_same(columns: tuple[Columns, Columns], view: int, earlier: int) -> bool:
+def _shows_the_same(columns: tuple[Columns, Columns], view: int, earlier: int, least_rows: int) -> bool:
     """Whether most points of a view, and all its curve observations, are where they were in an earlier view."""
-    least_rows = 4  # as for copies
     # Most of the noise is the same in both: an eighth of its variance differs, all of it between other frames. Twins of
     # photographs with a noise of 2 grey levels differ by a seventh of the noise, other frames by 1.3 times it or more.
     still, most = 0.5, 0.8
@@ -402,12 +403,15 @@ def _mark_rows(column: Columns, hashes: Hashes, frame: Indices, source: Indices)
 
 
 def _mark_views(
-    columns: tuple[Columns, Columns], hashes: Sequence[Hashes], place: Indices, sources: tuple[Indices, ...]
+    columns: tuple[Columns, Columns],
+    hashes: Sequence[Hashes],
+    place: Indices,
+    sources: tuple[Indices, ...],
+    least_rows: int,
 ) -> None:
     """Mark rows of views that repeat an earlier view of the same station and target entirely; `place` (V,) numbers
     these.
     """
-    least_rows = 4  # least number of rows of a copied view: fewer whole pixels agree by chance
     contents: list[list[Hashable]] = [[int(number)] for number in place]
     sizes, differs = np.zeros(len(place), dtype=np.int64), np.zeros(len(place), dtype=bool)
     own = [source < 0 for source in sources]
