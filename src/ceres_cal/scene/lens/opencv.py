@@ -9,11 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.scene.lens.base import LinearEquations, ahead
+from ceres_cal.base.arrays import Array
+from ceres_cal.scene.lens.base import ahead
 from ceres_cal.scene.lens.planar import DecentredLens
-
-_ORDERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 7, "s1": 2, "s2": 4, "s3": 2, "s4": 4}
 
 
 @dataclass(frozen=True)
@@ -36,14 +34,7 @@ class Brown(DecentredLens):
     )
     above: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3")
     below: ClassVar[tuple[str, ...]] = ("k4", "k5", "k6")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return ("k1", "k2", "p1", "p2", "k3", *self.names_of_terms)
-
-    @property
-    def orders(self) -> tuple[int, ...]:
-        return tuple(map(_ORDERS.__getitem__, self.names))
+    always: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3")
 
     @staticmethod
     def _flat(rays: Array) -> Array:
@@ -56,19 +47,6 @@ class Brown(DecentredLens):
     @staticmethod
     def _slopes(flat: Array) -> Array:
         return np.eye(3, 2)[:, :, None]
-
-    def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
-        u = ideal / phi
-        return {name: u**power for name, power in (("k1", 3), ("k2", 5), ("k3", 7))}, measured / phi - u
-
-    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
-        x, y, z = np.nan_to_num(self.undistort(offsets, phi)).T[:, :, None]
-        return np.asarray(phi * (np.hypot(x, y) / np.maximum(z, 0.05)) ** powers)
-
-    @property
-    def form(self) -> Array:
-        """The positions of k4 and s1 among the intrinsics, 0 if absent."""
-        return np.array([4.0 + self.names.index(name) if name in self.names else 0.0 for name in ("k4", "s1")])
 
 
 @dataclass(frozen=True)
@@ -84,15 +62,8 @@ class KannalaBrandt(DecentredLens):
     formulas: ClassVar[str] = "kannala-brandt"
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"tangential": ("p1", "p2")})
     above: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+    always: ClassVar[tuple[str, ...]] = above
     _end: ClassVar[float] = np.pi
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return ("k1", "k2", "k3", "k4", *self.names_of_terms)
-
-    @property
-    def orders(self) -> tuple[int, ...]:
-        return (3, 5, 7, 9, 2, 2)[: len(self.names)]
 
     @staticmethod
     def _flat(rays: Array) -> Array:
@@ -116,16 +87,3 @@ class KannalaBrandt(DecentredLens):
         bend = (np.cos(angle) - across) / angle**2
         both = bend * x * y
         return np.array([[across + bend * x * x, both], [both, across + bend * y * y], [-across * x, -across * y]])
-
-    def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
-        columns = {name: angle**power for name, power in zip(self.above, self.orders, strict=False)}
-        return columns, measured / phi - angle
-
-    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
-        x, y, z = np.nan_to_num(self.undistort(offsets, phi)).T[:, :, None]
-        return np.asarray(phi * np.arctan2(np.hypot(x, y), z) ** powers)
-
-    @property
-    def form(self) -> Array:
-        """The position of p1 among the intrinsics, 0 if absent."""
-        return np.array([8.0 if self.terms else 0.0])

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Frozen, cached_property
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, cached_property
 from ceres_cal.kernels import NOTHING, Optics, inverse_of_growing, lens_images, lens_rays
-from ceres_cal.scene.lens.base import Lens, unit_rays
+from ceres_cal.scene.lens.base import Lens, LinearEquations, unit_rays
 
 STEPS = 60  # limit as a safeguard: Newton needs 4 to 8
 
@@ -249,6 +249,10 @@ class Planar(Lens):
         return self._unit(phi) * self._rim
 
 
+_ACROSS = {"p1": 2, "p2": 2, "s1": 2, "s2": 4, "s3": 2, "s4": 4}
+"""Coefficients of Brown's decentring and of OpenCV's thin prism, with their orders."""
+
+
 class DecentredLens(Planar):
     """A ratio of polynomials along the radius, with Brown's decentring (p1, p2) and OpenCV's thin prism (s1 to s4)
     across.
@@ -258,15 +262,27 @@ class DecentredLens(Planar):
 
     above: ClassVar[tuple[str, ...]]
     below: ClassVar[tuple[str, ...]] = ()
+    always: ClassVar[tuple[str, ...]]
+    """Names of the coefficients that it has without further terms."""
+    _end: ClassVar[float] = np.inf
 
-    def _named(self, names: Sequence[str]) -> list[float]:
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.always, *self.names_of_terms)
+
+    @property
+    def orders(self) -> tuple[int, ...]:
+        along = {name: 2 * k + 3 for part in (self.above, self.below) for k, name in enumerate(part)}
+        return tuple(map((_ACROSS | along).__getitem__, self.names))
+
+    def _named(self, names: Iterable[str]) -> list[float]:
         known = self.coefficients
         return [known.get(name, 0.0) for name in names]
 
     @cached_property
     def _across(self) -> list[float]:
         """The values of p1 p2 s1 s2 s3 s4."""
-        return self._named(("p1", "p2", "s1", "s2", "s3", "s4"))
+        return self._named(_ACROSS)
 
     @property
     def _is_round(self) -> bool:
@@ -283,4 +299,18 @@ class DecentredLens(Planar):
         below = np.array([1.0, *(part for one in under for part in (0.0, one))])
         return ratio(less(above, np.convolve(worst, below)), below, self._end)
 
-    _end: ClassVar[float] = np.inf
+    def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
+        reach = ideal / phi if self.acts_on_tangents else angle
+        return {name: reach ** (2 * k + 3) for k, name in enumerate(self.above)}, measured / phi - reach
+
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
+        x, y, z = np.nan_to_num(self.undistort(offsets, phi)).T[:, :, None]
+        across = np.hypot(x, y)
+        reach = across / np.maximum(z, 0.05) if self.acts_on_tangents else np.arctan2(across, z)
+        return np.asarray(phi * reach**powers)
+
+    @property
+    def form(self) -> Array:
+        """The positions among the intrinsics of the first coefficient of each further term, 0 if absent."""
+        names, firsts = self.names, [own[0] for own in self.more_terms.values()]
+        return np.array([4.0 + names.index(first) if first in names else 0.0 for first in firsts])
