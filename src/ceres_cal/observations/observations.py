@@ -330,29 +330,20 @@ class Observations(Content):
         owner: dict[str, str] = {}
         placed: dict[str, str] = {}
         for number, (camera, station, target, placement) in enumerate(map(_NAMES, self.views)):
-            if (
-                camera not in self.cameras
-                or target not in self.targets
-                or owner.setdefault(station, camera) != camera
-                or (placement is not None and placed.setdefault(placement, target) != target)
-            ):
-                raise InputError(self._odd_view(number, owner, placed))
+            wrong = ""
+            if camera not in self.cameras:
+                wrong = no_such("camera", camera, self.cameras)
+            elif target not in self.targets:
+                wrong = no_such("target", target, self.targets)
+            elif (own := owner.setdefault(station, camera)) != camera:
+                wrong = f"station {station!r} belongs to camera {own!r} already"
+            elif placement is not None and (held := placed.setdefault(placement, target)) != target:
+                own_place = "give each rigid thing a placement of its own"
+                wrong = f"placement {placement!r} holds target {held!r} already; {own_place}"
+            if wrong:
+                raise InputError(f"{view_label(number, self.views)}: {wrong}")
         names = {"camera": self.cameras, "target": self.targets, "station": owner, "placement": placed}
         require_names({**names, "frame": {view.frame: None for view in self.views}})
-
-    def _odd_view(self, number: int, owner: Mapping[str, str], placed: Mapping[str, str]) -> str:
-        """Describe a view's error. owner, placed: camera of each station and target of each placement before it."""
-        here, view = view_label(number, self.views), self.views[number]
-        if view.camera not in self.cameras:
-            return f"{here}: {no_such('camera', view.camera, self.cameras)}"
-        if view.target not in self.targets:
-            return f"{here}: {no_such('target', view.target, self.targets)}"
-        if owner[view.station] != view.camera:
-            return f"{here}: station {view.station!r} belongs to camera {owner[view.station]!r} already"
-        return (
-            f"{here}: placement {view.placement!r} holds target {placed[str(view.placement)]!r} already; "
-            "give each rigid thing a placement of its own"
-        )
 
     def _check_columns(self, kind: str, known: Indices, first: int, column: Columns) -> None:
         """Check a block that begins with row `first`; known: number of features of each view's target."""
