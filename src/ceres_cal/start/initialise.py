@@ -278,20 +278,14 @@ def _poses_at(homographies: Homographies, phi: float) -> Array:
 
 def _blank_camera(name: str, image_size: tuple[int, int], options: Options, priors: Sequence[Prior]) -> Camera:
     """The camera with fixed numbers and principal point, and without phi."""
-    centre = [(image_size[0] - 1) / 2.0, (image_size[1] - 1) / 2.0]
-    aspect, skew = options.fixed.get("aspect", 1.0), options.fixed.get("skew", 0.0)
+    known = {"cx": (image_size[0] - 1) / 2.0, "cy": (image_size[1] - 1) / 2.0, "aspect": 1.0, "skew": 0.0}
     for prior in priors:
         if prior.owner == "camera" and prior.name == name:
-            if prior.quantity == "principal_point":
-                centre = list(prior.value)
-            elif prior.quantity in ("cx", "cy"):
-                centre[prior.quantity == "cy"] = prior.value[0]
-            elif prior.quantity == "aspect":
-                aspect = options.fixed.get("aspect", prior.value[0])
-            elif prior.quantity == "skew":
-                skew = options.fixed.get("skew", prior.value[0])
-    cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
-    blank = Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect, skew=skew)
+            quantities = ("cx", "cy") if prior.quantity == "principal_point" else (prior.quantity,)
+            known |= zip(quantities, prior.value, strict=True)
+    known |= options.fixed
+    centre = known["cx"], known["cy"]
+    blank = Camera(image_size, 1.0, centre, options.blank_lens, known["aspect"], skew=known["skew"])
     if set(blank.lens.names) <= set(options.held) and not blank.lens.may_fold:
         blank.require_monotone(name)
     return blank
