@@ -83,11 +83,8 @@ class Camera(Frozen, eq=True):
                 f"aspect {self.aspect}, principal point {(cx, cy)}, {self.lens.coefficients}, "
                 f"translation {self.cam_from_world.translation}"
             )
-        object.__setattr__(self, "image_size", (width, height))
-        object.__setattr__(self, "phi", float(self.phi))
-        object.__setattr__(self, "aspect", float(self.aspect))
-        object.__setattr__(self, "skew", float(self.skew))
-        object.__setattr__(self, "principal_point", (cx, cy))
+        plain = {name: float(getattr(self, name)) for name in ("phi", "aspect", "skew")}
+        vars(self).update(plain, image_size=(width, height), principal_point=(cx, cy))
 
     def __repr__(self) -> str:
         (width, height), place = self.image_size, ", ".join(f"{x:.2f}" for x in self.position)
