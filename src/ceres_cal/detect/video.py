@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import cv2
@@ -33,8 +34,9 @@ class Video(Frozen):
     capture: cv2.VideoCapture
     total: int
 
-    def frames(self, step: int) -> Iterator[tuple[int, Image]]:
+    def frames(self, step: int, progress: ImageProgress | None = None) -> Iterator[tuple[int, Image]]:
         """Yield every `step`-th frame with its number, all of one size; the others are passed over without decoding.
+        Progress is reported when the next one is asked for.
 
         Raises:
             InputError: none can be read.
@@ -48,6 +50,8 @@ class Video(Frozen):
                 if read and frame.shape == (shape or frame.shape):
                     shape = frame.shape
                     yield number, np.asarray(frame)
+                    if progress is not None:
+                        progress(number + 1, self.total, self.path.name)
         if shape is None:
             raise InputError(f"{self.path}: none of its {self.total} frames can be read: convert it to MP4")
 
@@ -92,10 +96,8 @@ def spread_frames(video: Path, count: int, progress: ImageProgress | None = None
         InputError: see `open_video` and `Video.frames`.
     """
     opened = open_video(video)
-    for number, frame in opened.frames(-(-opened.total // count)):
+    for number, frame in opened.frames(-(-opened.total // count), progress):
         yield f"frame {number} of {video.name}", frame
-        if progress is not None:
-            progress(number + 1, opened.total, video.name)
 
 
 def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgress | None = None) -> list[Path]:
@@ -108,22 +110,11 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
     opened = open_video(video)
     stretches = min(count, opened.total)
     written: list[Path] = []
-    best: tuple[int, float, Image] | None = None  # number of the stretch, sharpness and frame
-
-    def write(frame: Image) -> None:
+    frames = opened.frames(max(1, opened.total // (stretches * sampled)), progress)
+    for _, stretch in groupby(frames, key=lambda one: one[0] * stretches // opened.total):
+        _, sharpest = max(stretch, key=lambda one: _sharpness(one[1]))
         written.append(make_folder(folder) / f"{len(written) + 1:04d}.png")
-        write_bytes(written[-1], encoded(frame, ".png", 100))
-
-    for number, frame in opened.frames(max(1, opened.total // (stretches * sampled))):
-        stretch, sharp = number * stretches // opened.total, _sharpness(frame)
-        if best and best[0] != stretch:
-            write(best[2])
-        if best is None or best[0] != stretch or sharp > best[1]:
-            best = (stretch, sharp, frame)
-        if progress is not None:
-            progress(number + 1, opened.total, video.name)
-    if best:
-        write(best[2])
+        write_bytes(written[-1], encoded(sharpest, ".png", 100))
     return written
 
 
