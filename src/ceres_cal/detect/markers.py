@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ceres_cal.base import Array, Array32, Image, Image8, InputError, median
-from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import fit_edges
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.charuco_boards import dictionary_of
 from ceres_cal.scene.targets.marker_targets import CORNERS
@@ -92,13 +92,7 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
     share = np.linspace(ends, 1.0 - ends, count)
     places = (quad[:, None] + share[:, None] * along[:, None]).reshape(-1, 2)
     normals = np.repeat(outward, count, axis=0)
-    windows = cut_windows(image, places, normals, np.zeros(len(places)), half_px, half_width_px)
-    inside = windows.inside
-    if not inside.any():
-        return None
-    edge = np.zeros((len(places), 1))
-    blur_px = fit_shape(windows.take(inside), edge[inside], EdgeShape(1.0)).blur_px
-    fits = fit_profiles(windows, edge, blur_px, 0.5 * half_px)
+    _, fits, _ = fit_edges(image, places, normals, np.zeros(len(places)), half_px, half_width_px)
     offsets = np.where(fits.heights[:, 0] > 0.0, fits.offset_px, np.nan).reshape(4, count)
     every = zip(offsets, fits.sigma_px.reshape(4, count), lengths, strict=True)
     sides = [_side(2.0 * share - 1.0, *side) for side in every]

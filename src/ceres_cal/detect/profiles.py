@@ -167,6 +167,19 @@ def fit_profiles(
     return Profiles(np.where(good, offset, np.nan), np.where(good, sigma, np.inf), heights, noise)
 
 
+def fit_edges(
+    image: Array32, places: Array, normals: Array, curvature: Array, half_length_px: float, half_width_px: int
+) -> tuple[Mask, Profiles, float]:
+    """Fit one edge across each place on curves, see `cut_windows`. Return (N,) whether its window lies in the image,
+    the fits, and the blur that all edges share, px.
+    """
+    windows = cut_windows(image, places, normals, curvature, half_length_px, half_width_px)
+    inside, edge, shape = windows.inside, np.zeros((len(places), 1)), EdgeShape(1.0)
+    if inside.any():
+        shape = fit_shape(windows.take(inside), edge[inside], shape)
+    return inside, fit_profiles(windows, edge, shape.blur_px, 0.5 * half_length_px), shape.blur_px
+
+
 def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Array:
     """(N,) sum of squared residuals for any vector, even one that does not solve the normal equations."""
     explained = np.matmul(normal, solution[:, :, None])[:, :, 0]

@@ -15,7 +15,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Array32, Frozen, Indices32, InputError, Mask, frame_of, naming
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import fit_edges
 from ceres_cal.observations import NO_POINTS, Curves, Observations, View, taken
 from ceres_cal.scene.targets import rings
 
@@ -240,13 +240,9 @@ def _measured_ring(
     radius = track.radius(angle)
     outward = np.column_stack([np.cos(angle), np.sin(angle)])
     places = centre + radius[:, None] * outward
-    windows = cut_windows(grey, places, outward, -1.0 / radius, half_length_px, _HALF_WIDTH_PX)
-    edge = np.zeros((len(angle), 1))
-    inside = np.flatnonzero(windows.inside)
-    if not len(inside):
+    inside, fits, blur = fit_edges(grey, places, outward, -1.0 / radius, half_length_px, _HALF_WIDTH_PX)
+    if not inside.any():
         return np.full((len(angle), 2), np.nan), np.full(len(angle), np.inf), np.nan
-    blur = fit_shape(windows.take(inside), edge[inside], EdgeShape(1.0)).blur_px
-    fits = fit_profiles(windows, edge, blur, 0.5 * half_length_px)
     height = fits.heights[:, 0] * (1.0 if track.rises else -1.0)
     clear = height > np.maximum(_LEAST_CONTRAST * fits.noise, 0.3 * np.median(height[inside]))
     clear |= height > 0.7 * np.median(height[inside])
