@@ -108,10 +108,7 @@ def _clean(saddles: Saddles, shape: tuple[int, ...]) -> Saddles:
 
 def _padded(values: Array) -> Array:
     """Add one line of unknown corners on every side."""
-    rows, columns, *rest = values.shape
-    wider = np.full((rows + 2, columns + 2, *rest), np.nan)
-    wider[1:-1, 1:-1] = values
-    return wider
+    return np.pad(values, [(1, 1), (1, 1), *[(0, 0)] * (values.ndim - 2)], constant_values=np.nan)
 
 
 def _trimmed(saddles: Saddles) -> Saddles:
