@@ -109,12 +109,6 @@ class Tracker:
     known: list[tuple[Camera, tuple[object, ...], Any]] = field(default_factory=list)
     is_even: bool = False
 
-    def approached(self, camera: Camera) -> FieldLines:
-        """Follow from one start, with the kind of lens that it has. A start that leads to an earlier result is not
-        followed to its end.
-        """
-        return next(self.tried([camera]))
-
     def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> FieldLines:
         """Refine a camera that is right except for its lens: choose the kind of lens that fits best, and leave out
         misplaced curves. Lines that look like another field's are searched again near their drawn place, and a
@@ -257,9 +251,8 @@ class Tracker:
         # Possibly because of an unsuitable lens: a polynomial bends the lines of a strong one.
         if followed.built.is_other:
             other = whole.without_aside(whole.farther(whole.with_best_lens(followed)))
-            other = self.as_drawn(other) if other.built.is_other else other
             if other.built.is_other:  # the dimensions are those under the lens that fits better with them
-                return min(followed, other, key=whole._misfit_as_built)
+                return min(followed, other, key=lambda one: whole._misfit(whole.as_built(one)[1]))
             followed = other
         curves = [name for name in whole.curves if name not in followed.built.aside_m]
         left = replace(whole, curves=curves, target=followed.target)
@@ -278,22 +271,6 @@ class Tracker:
             tracker, camera = tracker._search_step(camera, _free(camera), reach) or (tracker, camera)
         there = tracker.at_rest(camera, _free(camera))
         return there if there.may_be_worn and there.share > followed.share else followed
-
-    def as_drawn(self, other: FieldLines) -> FieldLines:
-        """Return the field as drawn if all of its lines are there as well, although the result looks like another
-        field.
-
-        If the camera takes a line around the field for one of its own, it bends until areas and circle disagree. With
-        their dimensions free the camera is right, and the field's own lines are near where it predicts them.
-        """
-        there = self.as_built(other)[1]
-        if not there.is_sure:
-            return other
-        drawn = self.of_painted(there.camera).at_rest(there.camera, _free(there.camera))
-        if not drawn.is_sure:
-            return other
-        drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
-        return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
     def told(self, followed: FieldLines) -> FieldLines:
         """Refine with square pixels. Other pixels, for a picture stretched in one direction, are used only where they
@@ -315,10 +292,6 @@ class Tracker:
 
     def _misfit(self, followed: FieldLines) -> float:
         return misfit(followed.camera, self._with(followed)._observed(followed.lines, followed.camera))
-
-    def _misfit_as_built(self, followed: FieldLines) -> float:
-        """Misfit of the lines when they are followed with the dimensions that they indicate."""
-        return self._misfit(self.as_built(followed)[1])
 
     def _with(self, followed: FieldLines) -> Tracker:
         """Return the tracker for the curves, and the target as drawn, of a result."""

@@ -204,7 +204,7 @@ def _turned(problem: FieldSearch, camera: Camera) -> Camera:
 
 def _followed(problem: FieldSearch, camera: Camera) -> FieldLines:
     """Follow the target's lines from a camera that is about right, held by the points that it puts into the picture."""
-    return _tracker(problem, problem.grid.target, camera).approached(camera)
+    return next(_tracker(problem, problem.grid.target, camera).tried([camera]))
 
 
 def _tracker(problem: FieldSearch, target: Target, camera: Camera) -> Tracker:
