@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, distinct
+from ceres_cal.base import Array, Indices, Mask, distinct
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.observations import Points
@@ -15,13 +15,8 @@ from ceres_cal.scene import Camera, Target, distance_to_curve, in_image, nearest
 _AS_STATED = 2.0
 
 
-class _Branch(Frozen):
-    """A curve near a point: its normal in the image, the paint's offset along it, its variance, and the rows used."""
-
-    normal: Array
-    offset_px: float
-    variance: float
-    rows: Indices
+_Branch = tuple[Array, float, float, Indices]
+"""A curve near a point: its normal in the image, the paint's offset along it, px, its variance, and the rows used."""
 
 
 def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points, Mask]:
@@ -47,8 +42,8 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points
             features.append(number)
             pixels.append(pixel)
             sigmas.append(met[1])
-            for branch in branches:
-                used[branch.rows] = True
+            for *_, rows in branches:
+                used[rows] = True
     columns = np.array(features, np.int32), np.reshape(pixels, (-1, 2)), np.array(sigmas, float)
     return Points(np.zeros(len(features), np.int32), *columns), used
 
@@ -78,7 +73,7 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
     offset = covariance @ (basis.T @ (weight * lines.offset_px[rows]))
     squares = float(weight @ (lines.offset_px[rows] - basis @ offset) ** 2)
     more = max(1.0, (squares + _AS_STATED) / (len(rows) - 2 + _AS_STATED))
-    return _Branch(here.normals[0], float(offset[0]), more * float(covariance[0, 0]), rows)
+    return here.normals[0], float(offset[0]), more * float(covariance[0, 0]), rows
 
 
 def _met(branches: list[_Branch]) -> tuple[Array, float] | None:
@@ -88,12 +83,12 @@ def _met(branches: list[_Branch]) -> tuple[Array, float] | None:
     most_stretched = 3.0  # largest ratio of the crossing's longest standard deviation to its shortest
     if len(branches) < 2:
         return None
-    normals = np.array([branch.normal for branch in branches])
-    weight = np.array([1.0 / branch.variance for branch in branches])
+    across, offsets, variances, _ = zip(*branches, strict=True)
+    normals, weight = np.array(across), 1.0 / np.array(variances)
     information = normals.T @ (weight[:, None] * normals)
     least, most = np.linalg.eigvalsh(information)
     if not least > most / most_stretched**2:
         return None
     covariance = np.linalg.inv(information)
-    offset = covariance @ (normals.T @ (weight * np.array([branch.offset_px for branch in branches])))
+    offset = covariance @ (normals.T @ (weight * offsets))
     return offset, float(np.sqrt(0.5 * np.trace(covariance)))
