@@ -43,9 +43,10 @@ def _is_mirrored(grid: Array) -> bool:
 def _centres(grid: Array, places: Array, radius_m: float) -> Array:
     """Return the images of the circles' centres, given the middles of their pictures (rows, columns, 2) px."""
     middles = grid.reshape(-1, 2)
-    picture = smooth_picture(places, middles)
-    if picture is None:
+    fitted = smooth_picture(places, middles)
+    if fitted is None:
         return grid
+    picture = fitted[0]
     rims = picture((places[:, None] + radius_m * _RIM).reshape(-1, 2)).reshape(len(places), -1, 2)
     centres = picture(places)
     return np.asarray((middles - _middles(rims - centres[:, None])).reshape(grid.shape))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, median
-from ceres_cal.base.frozen import Frozen
 
 USUAL_PX = 0.1
 _MOST_DEGREES = 6
@@ -37,50 +36,34 @@ def scatter_px(grids: Iterable[Array], places: Array) -> float:
 
 def _of_board(grid: Array, board: Array) -> float | None:
     seen = ~np.isnan(grid[..., 0])
-    picture = smooth_picture(board[seen], grid[seen])
-    # The homography has used some of the equations, too.
-    if picture is None or picture.degree < 2 or picture.spare < _FEWEST_SPARE:
+    fitted = smooth_picture(board[seen], grid[seen])
+    if fitted is None:
         return None
-    return float(np.sqrt(np.sum((grid[seen] - picture(board[seen])) ** 2) / picture.spare))
+    picture, degree, spare = fitted
+    if degree < 2 or spare < _FEWEST_SPARE:  # the homography has used some of the equations, too
+        return None
+    return float(np.sqrt(np.sum((grid[seen] - picture(board[seen])) ** 2) / spare))
 
 
-class SmoothPicture(Frozen):
-    """A map from places on a board to pixels: a homography, and a polynomial of the places.
+def smooth_picture(places: Array, pixels: Array) -> tuple[Callable[[Array], Array], int, int] | None:
+    """Fit a smooth map to places (N, 2) on a board and their pixels (N, 2): a homography, and a polynomial of places.
 
-    Attributes:
-        degree: of the polynomial.
-        spare: degrees of freedom left.
+    Returns:
+        The map from any places (M, 2) to pixels (M, 2), the polynomial's degree, and the degrees of freedom left; None
+        where the places have no homography.
     """
-
-    homography: Array
-    middle: Array
-    size: float
-    degree: int
-    coefficients: Array
-    spare: int
-
-    def __call__(self, places: Array) -> Array:
-        """Return the pixels (N, 2) of places (N, 2) on the board."""
-        flat = cv2.perspectiveTransform(places[None], self.homography)[0]
-        terms = _terms((places - self.middle) / self.size, self.degree)
-        return np.asarray(flat + terms @ self.coefficients)
-
-
-def smooth_picture(places: Array, pixels: Array) -> SmoothPicture | None:
-    """Fit a smooth map to places (N, 2) on a board and their pixels (N, 2); None where they have no homography."""
     homography, _ = cv2.findHomography(places, pixels)
     if homography is None:
         return None
     middle, size = places.mean(axis=0), float(np.ptp(places, axis=0).max())
     degree = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= 2.0 * _SHARE * len(places))
-    terms = _terms((places - middle) / size, degree)
-    flat = cv2.perspectiveTransform(places[None], homography)[0]
-    coefficients, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)
-    return SmoothPicture(
-        np.asarray(homography, dtype=float), middle, size, degree, coefficients, 2 * (len(places) - int(rank))
-    )
 
+    def flat(there: Array) -> Array:
+        return np.asarray(cv2.perspectiveTransform(there[None], homography)[0])
 
-def _terms(places: Array, degree: int) -> Array:
-    x, y = places.T
-    return np.column_stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)])
+    def terms(there: Array) -> Array:
+        x, y = ((there - middle) / size).T
+        return np.column_stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)])
+
+    coefficients, _, rank, _ = np.linalg.lstsq(terms(places), pixels - flat(places), rcond=None)
+    return lambda there: flat(there) + terms(there) @ coefficients, degree, 2 * (len(places) - int(rank))
