@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base import Array, Mask, cached_property, eigh, grid_places, rms, two_digits
 from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness, required_powers
-from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces, derivative
+from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces, derivative, horner
 
 _GRID = COLUMNS, ROWS = 16, 12  # of a surface's nodes
 EXTENTS = ("wide", "high")
@@ -98,23 +98,19 @@ def pieces() -> Array:
     return table
 
 
-def profile_columns(u: Array, derivative: int = 0) -> Array:
-    """(N, count) B-splines that remain if value and slope at 0 are 0, or a derivative; linear beyond 1."""
+def profile_columns(u: Array, order: int = 0) -> Array:
+    """(N, count) B-splines that remain if value and slope at 0 are 0, or derivatives of some order; linear beyond 1."""
     inside = np.clip(u, 0.0, 1.0)
     j = np.minimum((inside * INTERVALS).astype(int), INTERVALS - 1)
-    table, t = pieces()[j], inside * INTERVALS - j
+    table, t = pieces()[j], np.repeat((inside * INTERVALS - j)[:, None], DEGREE + 1, axis=1)
+    for _ in range(order):
+        table = INTERVALS * derivative(table)
+    own = horner(np.moveaxis(table, -1, 0), t)
+    if order == 0:
+        own += np.maximum(u - 1.0, 0.0)[:, None] * horner(np.moveaxis(INTERVALS * derivative(table), -1, 0), t)
     values = np.zeros((len(u), INTERVALS + DEGREE))
-    slopes = np.zeros_like(values)
-    for d in range(DEGREE, derivative - 1, -1):
-        factor = np.prod(np.arange(d - derivative + 1, d + 1)) * float(INTERVALS) ** derivative
-        power = d - derivative
-        own = factor * table[:, :, d] * t[:, None] ** power
-        rise = own * 0.0 if power == 0 else factor * power * INTERVALS * table[:, :, d] * t[:, None] ** (power - 1)
-        for a in range(DEGREE + 1):
-            values[np.arange(len(u)), j + a] += own[:, a]
-            slopes[np.arange(len(u)), j + a] += rise[:, a]
-    beyond = np.maximum(u - 1.0, 0.0)[:, None]
-    return np.asarray((values + beyond * slopes if derivative == 0 else values)[:, 2:])
+    np.put_along_axis(values, j[:, None] + np.arange(DEGREE + 1), own, axis=1)
+    return values[:, 2:]
 
 
 @cache
