@@ -55,9 +55,7 @@ def _first_root(polynomial: tuple[float, ...]) -> float:
     if min(polynomial) >= 0.0:
         return np.inf
     # The roots of the reversed polynomial are 1 / x: its leading coefficient is 1, however small the last ones are.
-    companion = np.eye(len(polynomial) - 1, k=-1)
-    companion[0] = np.negative(polynomial[1:])
-    inverse = np.linalg.eigvals(companion)
+    inverse = np.roots(polynomial)
     size = np.abs(inverse)
     real = (np.abs(inverse.imag) <= 1e-9 * size) & (inverse.real > 1e-15 * np.max(size, initial=0.0))
     return 1.0 / float(np.max(inverse.real[real])) if np.any(real) else np.inf
