@@ -77,14 +77,10 @@ def _places(
     return number[inside], s[inside]
 
 
-def _ends(target: Target) -> Array:
-    """(C, 2) parameters where the target's curves begin and end."""
-    return np.array([curve.parameter_range for curve in target.curves.values()]).reshape(-1, 2)
-
-
 def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Course:
     """Return the course through places that are given by curve (N,) and parameter (N,)."""
-    span = np.diff(_ends(target)[number])[:, 0]
+    every = target.evenly[0]
+    span = (every[:, -1] - every[:, 0])[number]
     steps = np.array([-2e-3, 0.0, 2e-3, 0.0, 0.0])[:, None] * span
     tracks = np.stack([target.tracks[side][number] for side in (0, 0, 0, 1, -1)]).reshape(-1, 3, 3)
     places = along_track(tracks, np.tile(target.is_arc[number], 5), (s + steps).ravel())
