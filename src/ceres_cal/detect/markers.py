@@ -122,9 +122,6 @@ def _crossings(quad: Array, sides: Array) -> Array:
     along /= np.linalg.norm(along, axis=1)[:, None]
     outward = np.column_stack([along[:, 1], -along[:, 0]])
     begins, ends = sides[:, 0] - sides[:, 1], sides[:, 0] + sides[:, 1]
-    corners = np.empty((4, 2))
-    for corner in range(4):
-        before = corner - 1
-        normals = np.array([outward[before], outward[corner]])
-        corners[corner] = quad[corner] + np.linalg.solve(normals, [ends[before], begins[corner]])
-    return corners
+    normals = np.stack([np.roll(outward, 1, axis=0), outward], axis=1)  # of the side before each corner, and after it
+    moved = np.linalg.solve(normals, np.stack([np.roll(ends, 1), begins], axis=1)[..., None])
+    return np.asarray(quad + moved[..., 0])
