@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Array32, Indices, Mask, Rows, median, medians
+from ceres_cal.base import Array, Array32, Indices, Mask, Rows, median, medians
 
 _SCALES = (1, 2)  # a photograph is searched at full size for narrow paint, and at half size for wide paint
 _SIGMA_PX = 1.6
@@ -177,7 +177,7 @@ def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[A
 def _second(soft: Array32) -> tuple[Array32, ...]:
     """Second derivatives: by x twice, by y twice, and by x and y."""
     orders = ((2, 0), (0, 2), (1, 1))
-    return tuple(_single(np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0) for order in orders)
+    return tuple(np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, scale=0.25), np.float32) for order in orders)
 
 
 def _bends(xx: Array32, yy: Array32, xy: Array32) -> tuple[Array32, Array32]:
@@ -186,11 +186,7 @@ def _bends(xx: Array32, yy: Array32, xy: Array32) -> tuple[Array32, Array32]:
 
 
 def _smoothed(grey: Array32, sigma_px: float) -> Array32:
-    return _single(np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma_px)))
-
-
-def _single(plane: AnyArray) -> Array32:
-    return np.asarray(plane, dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma_px), np.float32)
 
 
 def _strokes(pixels: Array, strength: Array, piece: Indices) -> Strokes:
