@@ -28,7 +28,8 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
     if content.startswith(b"\xff\xd8\xff"):
         return _jpeg(content)
     if order := _ORDERS.get(content[:4]):
-        return _tiff(content, order)
+        width, height = _tags(content, order, 256, 257)
+        return width, height
     if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
         return _webp(content)
     if content.startswith(b"\xff\x4f\xff\x51"):
@@ -94,11 +95,6 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
             height, width = _unpack(">HH", content, at + 5)
             return width, height
         at += 1 if code == 0xFF else 2 + length  # a header may begin with several bytes 0xFF
-
-
-def _tiff(content: bytes, order: str) -> tuple[int, int]:
-    width, height = _tags(content, order, 256, 257)
-    return width, height
 
 
 def _tags(content: bytes, order: str, *wanted: int, at: int = 0) -> list[int]:
