@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, Frozen, Indices, InputError, Poses, SolutionError, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, InputError, Poses, SolutionError, replace
 from ceres_cal.base.threads import at_most, available, for_small_matrices
 from ceres_cal.observations.sights import Owner, SightKey
 from ceres_cal.problem.costs import CachedCost, CostValue, Run
@@ -225,15 +225,14 @@ class SharedCost(CachedCost):
         super().__init__(run)
         self._judged, self._asked = judged, judged.asked(problem, estimate)
         layout, sizes, count = problem.layout, dict[Owner, int](), len(estimate.structure.values)
-        self._of: dict[SightKey, list[Owner]] = {}
         for key in judged.keys:
             every = len(layout.free[key.camera]), 6 * (key.station in layout.stations), 0, count
-            own = {owner: size for owner, size in zip(key.owners, every, strict=True) if size}
-            self._of[key] = list(own)
-            sizes |= own
+            sizes |= {owner: size for owner, size in zip(key.owners, every, strict=True) if size}
         ends = np.cumsum([0, *sizes.values()])
         self._columns = {owner: np.arange(*ends[n : n + 2]) for n, owner in enumerate(sizes)}
-        rows = sum(1 + sum(sizes[owner] for owner in own) for own in self._of.values())
+        each = {key: [self._columns[owner] for owner in key.owners if owner in sizes] for key in judged.keys}
+        self._of = {key: np.concatenate([np.empty(0, np.int64), *own]) for key, own in each.items()}
+        rows = sum(1 + len(columns) for columns in self._of.values())
         self._shape = rows, int(ends[-1])
         self._take(sizes, rows)
 
@@ -244,13 +243,9 @@ class SharedCost(CachedCost):
             return None
         residuals, jacobian, row = np.zeros(self._shape[0]), np.zeros(self._shape), 0
         for key, block in blocks.items():
-            columns, rows = self._columns_of(key), slice(row, row + len(block))
+            columns, rows = self._of[key], slice(row, row + len(block))
             jacobian[rows, columns], residuals[rows], row = block[:, :-1], block[:, -1], row + len(block)
         return CostValue(at, residuals, [jacobian[:, columns].reshape(-1) for columns in self._columns.values()])
-
-    def _columns_of(self, key: SightKey) -> Indices:
-        """The columns of the numbers that a sight depends on."""
-        return np.concatenate([np.empty(0, np.int64), *(self._columns[owner] for owner in self._of[key])])
 
 
 def of_world(estimate: Estimate) -> Estimate:
