@@ -7,7 +7,6 @@ scaled to be of order one) and one 6-vector (rotation vector, translation) per f
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 
@@ -374,28 +373,25 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
 
     Boards alone determine only relative poses; holding one station removes this freedom.
     """
-    views = observations.shown_views
-    times = Counter([view.placement for view in views])
-    group = {view.station: view.station for view in views}
-    first_seen: dict[str, str] = {}
-    tied: set[str] = set()
+    seen_by = dict[str | None, set[str]]()
+    for view in observations.shown_views:
+        seen_by.setdefault(view.placement, set()).add(view.station)
+    known = seen_by.pop(None, set())
+    together, anchors = [stations for stations in seen_by.values() if len(stations) > 1], list[str]()
+    for name in dict.fromkeys(view.station for view in observations.shown_views):
+        known = connected(known, together)
+        if name not in known:
+            anchors.append(name)
+            known.add(name)
+    return frozenset(anchors)
 
-    def root(name: str) -> str:
-        while group[name] != name:
-            name = group[name]
-        return name
 
-    for view in views:
-        if view.placement is None:
-            tied.add(view.station)
-        elif times[view.placement] > 1:
-            group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
-    tied_groups = {root(name) for name in tied}
-    anchors: dict[str, str] = {}
-    for name in group:
-        if root(name) not in tied_groups:
-            anchors.setdefault(root(name), name)
-    return frozenset(anchors.values())
+def connected(start: Iterable[str], groups: Iterable[set[str]]) -> set[str]:
+    """The start, and everything that groups connect with it, each with what it overlaps."""
+    linked, before = {*start}, set[str]()
+    while linked != before:
+        before, linked = linked, linked.union(*(group for group in groups if group & linked))
+    return linked
 
 
 # ---- charts: the numbers of a camera as Ceres moves them ------------------------------------------------------------

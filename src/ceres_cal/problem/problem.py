@@ -11,7 +11,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, field, replace
 from ceres_cal.observations import Observations, SightKey, Sights
 from ceres_cal.problem.information import Information
-from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, intrinsic_names, make_layout
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, connected, intrinsic_names, make_layout
 from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.quantities import free_keys, intrinsic_keys
 from ceres_cal.problem.structure import EXACT
@@ -188,9 +188,7 @@ class Problem(Frozen):
         for key in self.sights.keys:
             seen.setdefault(key.placement, set()).add(key.camera)
         together += [cameras for placement, cameras in seen.items() if placement in self.layout.placements]
-        linked, before = {camera}, set[str]()
-        while linked != before:
-            before, linked = linked, linked.union(*(cameras for cameras in together if cameras & linked))
+        linked = connected([camera], together)
         if linked >= {*self.layout.free}:
             return self
         part = self.of_sights(np.flatnonzero([key.camera in linked for key in self.sights.keys]))
