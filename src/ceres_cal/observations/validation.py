@@ -65,19 +65,24 @@ def require_alike(content: Content) -> None:
     """Raise InputError where a sigma differs so much from the others that its observation, or the others, have no
     effect.
     """
-    columns = {"point": content.points, "curve": content.curves}
-    ends = [end for column in columns.values() for end in each_block(_extremes, column.sigma_px)]
+    columns = content.points, content.curves
+    ends = [end for column in columns for end in each_block(_extremes, column.sigma_px)]
     if max(high for _, high in ends) <= _SIGMA_RATIO * min(low for low, _ in ends):
         return
-    sigmas = np.concatenate([column.sigma_px for column in columns.values()])
+    sigmas = np.concatenate([column.sigma_px for column in columns])
     usual_px = median(sigmas)
     row = int(np.argmax(np.abs(np.log(sigmas / usual_px))))
-    kind, number = ("point", row) if row < len(content.points) else ("curve", row - len(content.points))
     raise InputError(
-        f"{view_label(columns[kind].view[number], content.views)}, {kind} {content.feature_name(kind, number)!r}: its "
-        f"sigma_px is {sigmas[row]:g}, but {usual_px:g} is usual: sigmas may differ by a factor of {_SIGMA_RATIO:.0f} "
-        "at most: correct it, or leave the observation out"
+        f"{_label(content, row)}: its sigma_px is {sigmas[row]:g}, but {usual_px:g} is usual: sigmas may differ by a "
+        f"factor of {_SIGMA_RATIO:.0f} at most: correct it, or leave the observation out"
     )
+
+
+def _label(content: Content, row: int) -> str:
+    """Name of an observation in messages, by its row among the points and then the curve observations."""
+    kind, number = ("point", row) if row < len(content.points) else ("curve", row - len(content.points))
+    column: Columns = content.points if kind == "point" else content.curves
+    return f"{view_label(column.view[number], content.views)}, {kind} {content.feature_name(kind, number)!r}"
 
 
 def _extremes(_: int, block: Array) -> tuple[float, float]:
@@ -94,30 +99,26 @@ def stray_pixels(content: Content) -> tuple[str, ...]:
     if _all_inside(content):
         return ()
     sizes = np.array([content.cameras[view.camera] for view in content.views])
-    points, curves = (_outside(column, sizes) for column in (content.points, content.curves))
     owners = np.array([view.camera for view in content.views])
+    columns = content.points, content.curves
+    view, pixels = np.concatenate([one.view for one in columns]), np.concatenate([one.pixels for one in columns])
+    outside = np.any((pixels < -_MARGIN_PX) | (pixels > _end(sizes[view])), axis=1)
     lines = []
     for camera, size in content.cameras.items():
-        own = owners == camera
-        mine = own[content.points.view], own[content.curves.view]
-        count = sum(np.count_nonzero(out & here) for out, here in zip((points, curves), mine, strict=True))
-        total = sum(np.count_nonzero(here) for here in mine)
+        mine = (owners == camera)[view]
+        count, total = np.count_nonzero(outside & mine), np.count_nonzero(mine)
         if not count:
             continue
-        first = _first(content, points & mine[0], curves & mine[1])
-        pixels = np.concatenate([content.points.pixels[mine[0]], content.curves.pixels[mine[1]]])
-        if not np.all(np.abs(pixels) <= _FAR * float(np.hypot(*size))):
-            far = [
-                np.any(np.abs(column.pixels) > _FAR * float(np.hypot(*size)), axis=1) & here
-                for column, here in zip((content.points, content.curves), mine, strict=True)
-            ]
+        far = mine & np.any(np.abs(pixels) > _FAR * float(np.hypot(*size)), axis=1)
+        first = _label_at(content, int(np.argmax(far if far.any() else outside & mine)), pixels)
+        if far.any():
             raise InputError(
-                f"camera {camera!r}: its image is {size[0]} x {size[1]} px, but {_first(content, *far)} lies "
-                f"{_FAR:.0f} image diagonals away: correct or remove it"
+                f"camera {camera!r}: its image is {size[0]} x {size[1]} px, but {first} lies {_FAR:.0f} image "
+                "diagonals away: correct or remove it"
             )
         text = f"camera {camera!r}: {count} of {total} observations lie outside its image"
         if count > max(1.0, _FEW * total):
-            raise InputError(f"{text}: {_cause(pixels, size)}; the first is {first}")
+            raise InputError(f"{text}: {_cause(pixels[mine], size)}; the first is {first}")
         lines.append(f"{text} of {size[0]} x {size[1]} px, the first is {first}: correct or remove what lies outside")
     return tuple(lines)
 
@@ -137,12 +138,6 @@ def _end(size: Sequence[int] | Array) -> Array:
     return np.asarray(size) - 1.0 + _MARGIN_PX
 
 
-def _outside(column: Columns, sizes: Array) -> Mask:
-    """(N,) which observations lie outside; `sizes` (V, 2) are those of the views' images."""
-    seen = column.pixels
-    return np.asarray(np.any((seen < -_MARGIN_PX) | (seen > _end(sizes[column.view])), axis=1))
-
-
 def _cause(pixels: Array, size: Sequence[int]) -> str:
     """Return what the pixels show to be wrong with the image size, or with themselves."""
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
@@ -156,14 +151,11 @@ def _cause(pixels: Array, size: Sequence[int]) -> str:
     return f"{reach}: give the size of the pictures in which the pixels were measured"
 
 
-def _first(content: Content, points: Mask, curves: Mask) -> str:
+def _label_at(content: Content, row: int, pixels: Array) -> str:
+    """Name of an observation with its pixel."""
     long = 1e6  # px: printed with an exponent
-    column: Columns = content.points if points.any() else content.curves
-    row = int(np.argmax(points if points.any() else curves))
-    kind = "curve" if isinstance(column, Curves) else "point"
-    feature, (x, y) = content.feature_name(kind, row), column.pixels[row]
-    at = ", ".join(f"{value:.1f}" if abs(value) < long else f"{value:g}" for value in (x, y))
-    return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({at})"
+    at = ", ".join(f"{value:.1f}" if abs(value) < long else f"{value:g}" for value in pixels[row])
+    return f"{_label(content, row)}: pixel ({at})"
 
 
 def require_filled(content: Content) -> None:
