@@ -111,8 +111,8 @@ class Tracker:
 
     def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> FieldLines:
         """Refine a camera that is right except for its lens: choose the kind of lens that fits best, and leave out
-        misplaced curves. Lines that look like another field's are searched again near their drawn place, and a
-        stretched picture is tried.
+        misplaced curves. Lines that look like another field's are searched again from farther off, and a stretched
+        picture is tried.
 
         Args:
             lacking: parts that this field is known to lack.
