@@ -14,7 +14,7 @@ import numpy as np
 
 from ceres_cal.base import HEIGHTS_M, Array, InputError, Pose, finite, quaternion, rotation_exp, rotation_of, short
 from ceres_cal.base.least_squares import least_squares
-from ceres_cal.formats.format import ExportLoss, ExportRequest
+from ceres_cal.formats.format import Export, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels, nearest_foreign
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene import LARGEST, Camera, Radial, opencv_models
@@ -45,10 +45,8 @@ def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
     return tuple(map(int, texts))
 
 
-def to_entries(
-    request: ExportRequest, camera_id: str, box_m: Box | None
-) -> tuple[dict[int, dict[str, Any]], list[ExportLoss], list[str]]:
-    """Return id -> SSL_GeometryCameraCalibration as plain data; the errors; and warnings for readers of the message."""
+def to_entries(request: ExportRequest, camera_id: str, box_m: Box | None) -> tuple[dict[int, dict[str, Any]], Export]:
+    """Return id -> SSL_GeometryCameraCalibration as plain data, and their export, whose content is still empty."""
     entries, losses, warnings = {}, [], []
     ids = camera_ids(request.stations, camera_id)
     for name, number in zip(request.stations, ids, strict=True):
@@ -60,7 +58,8 @@ def to_entries(
         warnings += [
             f"station {name!r}: {text}" for text in (*_less_lost(camera, losses[-1], box_m), *reader_traps(entry))
         ]
-    return entries, losses, warnings
+    facts = {"camera_ids": dict(zip(request.stations, ids, strict=True))}
+    return entries, Export(b"", tuple(losses), f"camera {', '.join(map(str, ids))}", facts, tuple(warnings))
 
 
 def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]:

@@ -35,16 +35,14 @@ def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any
     else:
         raise InputError("the message needs a field, but the calibration has none: export into a file with a field, "
                          "such as one that `ceres-cal listen` wrote")  # fmt: skip
-    entries, losses, warnings = to_entries(request, camera_id, field_box(targets))
+    entries, exported = to_entries(request, camera_id, field_box(targets))
     others = {int(entry["camera_id"]): dict(entry) for entry in before.get("calib") or []}
     written = {number: as_before(entry, others.get(number)) for number, entry in entries.items()}
     cameras = dict(sorted({**others, **written}.items()))
     data = {"field": size, "calib": list(cameras.values())}
     if before.get("models"):
         data["models"] = before["models"]
-    words = f"camera {', '.join(map(str, entries))} of {len(cameras)} in ssl-vision's model"
-    facts = {"camera_ids": dict(zip(request.stations, entries, strict=True))}
-    return data, Export(b"", tuple(losses), words, facts, tuple(warnings))
+    return data, replace(exported, words=f"{exported.words} of {len(cameras)} in ssl-vision's model")
 
 
 def _export_packet(request: ExportRequest, *, camera_id: CameraIds = "") -> Export:

@@ -13,7 +13,7 @@ from xml.sax.saxutils import escape
 
 from msgspec import Struct
 
-from ceres_cal.base import InputError, finite
+from ceres_cal.base import InputError, finite, replace
 from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.opencv import ImageSize
@@ -131,7 +131,7 @@ def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Export:
     values = values_in(request.existing)
     there, box = _cameras(values), field_box(request.calibration.targets)
     box = box or field_box({"field": settings_target(values)})
-    entries, losses, warnings = to_entries(request, camera_id, box)
+    entries, exported = to_entries(request, camera_id, box)
     changes: list[tuple[_Var, str]] = []
     for number, entry in entries.items():
         if number not in there:
@@ -140,10 +140,9 @@ def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Export:
     content = request.existing
     for one, text in sorted(changes, key=lambda change: -change[0].start):
         content = content[: one.start] + escape(text).encode() + content[one.end :]
-    warnings.append("ssl-vision reads this file at its start and overwrites it at its end: it must be closed meanwhile")
-    words = f"camera {', '.join(map(str, entries))} in ssl-vision's settings"
-    facts = {"camera_ids": dict(zip(request.stations, entries, strict=True))}
-    return Export(content, tuple(losses), words, facts, tuple(warnings))
+    closed = "ssl-vision reads this file at its start and overwrites it at its end: it must be closed meanwhile"
+    words, warnings = f"{exported.words} in ssl-vision's settings", (*exported.warnings, closed)
+    return replace(exported, content=content, words=words, warnings=warnings)
 
 
 def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -> Iterator[tuple[_Var, str]]:
