@@ -1,6 +1,5 @@
 from ceres_cal.base import words as words
 from ceres_cal.base.archives import Column as Column
-from ceres_cal.base.archives import read_foreign_npz as read_foreign_npz
 from ceres_cal.base.archives import read_npz as read_npz
 from ceres_cal.base.archives import require_columns as require_columns
 from ceres_cal.base.arrays import NOTHING as NOTHING

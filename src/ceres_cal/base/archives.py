@@ -24,34 +24,21 @@ Column = tuple[Any, tuple[int | str, ...]]
 """Type and lengths that a column must have; a letter stands for a length that is the same in all columns."""
 
 
-def read_npz(content: bytes, columns: Mapping[str, Column], where: str) -> dict[str, AnyArray]:
-    """Read the columns of an NPZ file, each as it is described.
+def read_npz(content: bytes, columns: Mapping[str, Column] | None, where: str) -> dict[str, AnyArray]:
+    """Read the columns of an NPZ file, each as it is described; None: whatever a file of another program has.
 
     Raises:
         InputError: no NPZ file, cut short, pickled objects, a column that is missing, unknown, duplicated, too large,
             or of another type or shape.
     """
-    arrays = _read(content, columns, where)
-    _require_fitting(arrays, columns, where)
-    return arrays
-
-
-def read_foreign_npz(content: bytes, where: str) -> dict[str, AnyArray]:
-    """Read the columns of an NPZ file of another program, whatever they are.
-
-    Raises:
-        InputError: no NPZ file, cut short, pickled objects, a column that is duplicated or too large.
-    """
-    return _read(content, None, where)
-
-
-def _read(content: bytes, columns: Mapping[str, Column] | None, where: str) -> dict[str, AnyArray]:
     import zipfile
 
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive, warnings.catch_warnings(action="ignore"):
-            names = _names(archive, columns, where)
-            return {name: _column(archive, name, None if columns is None else columns[name], where) for name in names}
+            names, known = _names(archive, columns, where), columns or {}
+            arrays = {name: _column(archive, name, known.get(name), where) for name in names}
+            _require_fitting(arrays, known, where)
+            return arrays
     except InputError:
         raise
     except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen types of errors for a broken archive

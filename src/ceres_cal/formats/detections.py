@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base import InputError, did_you_mean, finite, read_foreign_npz, replace, require_room
+from ceres_cal.base import InputError, did_you_mean, finite, read_npz, replace, require_room
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
@@ -105,7 +105,7 @@ def _csv_rows(request: ImportRequest) -> tuple[Mapping[int, dict[str, Any]], Seq
 
 def _npz_rows(request: ImportRequest) -> tuple[Mapping[int, dict[str, Any]], Sequence[str]]:
     """Return rows by names, each under its number, and the names."""
-    columns = read_foreign_npz(request.content, str(request.path))
+    columns = read_npz(request.content, None, str(request.path))
     require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
     lengths = {array.shape for array in columns.values()}
     if len(lengths) != 1 or any(len(shape) != 1 for shape in lengths):
@@ -214,7 +214,7 @@ def _read_mrcal(request: ImportRequest) -> Observations:
     if "optimization_inputs" not in data:
         raise InputError("it has no optimization_inputs: mrcal did not store its observations")
     try:
-        given = read_foreign_npz(base64.b85decode(data["optimization_inputs"]), str(request.path))
+        given = read_npz(base64.b85decode(data["optimization_inputs"]), None, str(request.path))
         boards = np.asarray(given["observations_board"], dtype=float)
         indices = np.asarray(given["indices_frame_camintrinsics_camextrinsics"], dtype=int)
         spacing, sizes = float(given["calibration_object_spacing"]), np.asarray(given["imagersizes"], dtype=int)
