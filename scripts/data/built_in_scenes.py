@@ -10,14 +10,14 @@ from typing import Any
 
 from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose, rings_scene
 
-from ceres_cal.base.files import write_json
+from ceres_cal.base.files import UNITS, write_json
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera, camera_to_json
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import Disturbance, Scene
-from ceres_cal.simulate.files import SCENE_FORMAT, SCENE_VERSION, UNITS
+from ceres_cal.simulate.files import SCENE_FORMAT, SCENE_VERSION
 
 FOLDER = Path(__file__).resolve().parents[2] / "src/ceres_cal/simulate/scenes"
 _WORKDAY = Disturbance(

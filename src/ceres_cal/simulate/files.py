@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, InputError, body_of, convert, make_folder, naming, read_json, write_json
+from ceres_cal.base.files import UNITS
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene import Camera, CameraFile, Vector, camera_to_json, targets_from_specs
@@ -20,7 +21,6 @@ from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Trut
 
 SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
 TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
-UNITS = "metres, radians, pixels"
 
 Settings = TypeVar("Settings", Disturbance, ViewPlan)
 
@@ -133,30 +133,25 @@ def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
     Args:
         simulations: name of the file of observations -> its simulation. Their scenes must agree on shared names.
     """
-    truth: dict[str, Any] = {
+    scenes = [simulation.scene for simulation in simulations.values()]
+    return {
         "format": TRUTH_FORMAT,
         "version": TRUTH_VERSION,
         "units": UNITS,
-        "cameras": {},
-        "stations": {},
-        "placements": {},
-        "files": {},
+        "cameras": {name: camera_to_json(camera) for scene in scenes for name, camera in scene.cameras.items()},
+        "stations": {name: _station_truth(station) for scene in scenes for name, station in scene.stations.items()},
+        "placements": {name: _placement_truth(pose) for scene in scenes for name, pose in scene.placements.items()},
+        "files": {name: _file_truth(simulation) for name, simulation in simulations.items()},
     }
-    for file_name, simulation in simulations.items():
-        scene = simulation.scene
-        truth["cameras"] |= {name: camera_to_json(camera) for name, camera in scene.cameras.items()}
-        truth["stations"] |= {name: _station_truth(station) for name, station in scene.stations.items()}
-        truth["placements"] |= {
-            name: {"translation_m": _tidy(pose.translation), "rotation": _tidy(pose.rotation)}
-            for name, pose in scene.placements.items()
-        }
-        truth["files"][file_name] = {
-            "seed": simulation.seed,
-            "disturbance": asdict(simulation.disturbance),
-            "points": _rows_truth(simulation.points),
-            "curves": _rows_truth(simulation.curves),
-        }
-    return truth
+
+
+def _placement_truth(pose: Pose) -> dict[str, Any]:
+    return {"translation_m": _tidy(pose.translation), "rotation": _tidy(pose.rotation)}
+
+
+def _file_truth(simulation: Simulation) -> dict[str, Any]:
+    rows = {name: _rows_truth(getattr(simulation, name)) for name in ("points", "curves")}
+    return {"seed": simulation.seed, "disturbance": asdict(simulation.disturbance), **rows}
 
 
 def _station_truth(station: Station) -> dict[str, Any]:
