@@ -122,11 +122,7 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
             continue  # the whole feature lies elsewhere, and only crosses the other: a circle of another radius
         near = sight.chance(is_curve, float(away[chosen].max()))
         log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
-        groups.append(
-            WrongLabel(
-                is_curve, view, int(label), int(instead), rows[chosen], away[chosen], log_p
-            )
-        )  # fmt: skip
+        groups.append(WrongLabel(is_curve, view, int(label), int(instead), rows[chosen], away[chosen], log_p))
     return groups
 
 

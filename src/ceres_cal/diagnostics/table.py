@@ -153,7 +153,7 @@ def make_table(inliers: Inliers, model: Linearised, weight: Array, cameras: Mapp
     pixel = column_of(observations, "pixels")
     residual, shown = np.full((count, 2), np.nan), equations.observation
     residual[shown] = equations.displacement(equations.residual, count)[shown]
-    distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
+    distance = np.where(is_curve, _at(shown, equations.residual, count), np.linalg.norm(residual, axis=1))
     inlier = inliers.rows
     original = np.concatenate(observations.copies.originals)
     seen = np.isfinite(residual[:, 0])
@@ -170,9 +170,9 @@ def make_table(inliers: Inliers, model: Linearised, weight: Array, cameras: Mapp
         error_mm(equations, equations.residual, count),
         column_of(observations, "sigma_px"),
         np.where(is_curve, inliers.curve_scale, inliers.point_scale),
-        np.where(inlier, _spread_out(equations, weight, count), 0.0),
+        np.where(inlier, _at(shown, weight, count), 0.0),
         _mean_leverage(model, count),
-        _standardised(model, count),
+        _at(*model.studentised, count),
         _radii(observations, view, pixel, cameras),
         np.select([inlier, seen, original], [INLIER, TOO_FAR, NOT_SEEN], COPIED).astype(np.int8),
     )
@@ -188,10 +188,10 @@ def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Indices
     return (*points, *curves), np.array(starts, dtype=np.int64)
 
 
-def _spread_out(equations: Equations, values: Array, count: int) -> Array:
-    """(N,) value of each equation at its observation, of a point's two the second; NaN where there is none."""
+def _at(observation: Indices, values: Array, count: int) -> Array:
+    """(N,) values at their observations, of several the last one (of a point's two equations); NaN without any."""
     column = np.full(count, np.nan)
-    column[equations.observation] = values
+    column[observation] = values
     return column
 
 
@@ -214,13 +214,6 @@ def _mean_leverage(model: Linearised, count: int) -> Array:
     sums = np.bincount(equations.observation, leverage, count)
     numbers = np.bincount(equations.observation, minlength=count)
     return np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
-
-
-def _standardised(model: Linearised, count: int) -> Array:
-    answer = np.full(count, np.nan)
-    observation, length = model.studentised
-    answer[observation] = length
-    return answer
 
 
 def _radii(observations: Observations, view: Indices, pixel: Array, cameras: Mapping[str, Camera]) -> Array:
