@@ -16,7 +16,6 @@ from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
-    from ceres_cal.calibration.renaming import Renaming
     from ceres_cal.observations import Observations
     from ceres_cal.problem import Options, Progress, SolveProgress, Tolerance
 
@@ -152,9 +151,10 @@ def _run(args: CalibrateArguments) -> Document:
     options = _options(args, observations, fixed=fixed, powers=powers)
     with ProgressBar(args.silent) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
+        from ceres_cal.calibration.renaming import find_renaming
 
         workers = {} if client is None else {"client": client}
-        renaming = _renaming(observations, options) if args.mend_labels else None
+        renaming = find_renaming(observations, options) if args.mend_labels else None
         observations = renaming.corrected(observations) if renaming else observations
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
         wrong = tuple(diagnostics.renamings(observations, calibration)) if calibration.rounds else ()
@@ -166,12 +166,6 @@ def _run(args: CalibrateArguments) -> Document:
     # Remarks, which cost no trust: beside features that were taken out, the others were as accurate as stated.
     calibration = replace(calibration, remarks=(*calibration.remarks, *(f"{words}: {done}" for words in found)))
     return files.calibrated(args, calibration, observations, photographs, args.observations)
-
-
-def _renaming(observations: Observations, options: Options) -> Renaming | None:
-    from ceres_cal.calibration.renaming import find_renaming
-
-    return find_renaming(observations, options)
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:

@@ -118,16 +118,11 @@ def add_options(parser: Parser, kind: type[Arguments]) -> None:
 
 def filled(kind: type[_T], given: argparse.Namespace) -> _T:
     """Make the dataclass from what was typed."""
-    values = vars(given)
-    typed = {name.removeprefix(_FORM): text for name, text in values.items() if name.startswith(_FORM)}
-    every = fields(kind)  # type: ignore[arg-type]
-    of_forms = {one.name: typed for one in every if "forms" in one.metadata}
-    typed_as = {one.name: values[one.name] for one in every if one.name not in of_forms}
-    own = {name: tuple(value) if isinstance(value, list) else value for name, value in typed_as.items()}
-    given_of = {
-        name: {key: text for key, text in texts.items() if text is not None} for name, texts in of_forms.items()
-    }
-    return kind(**own, **given_of)
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in vars(given).items()}
+    every = {name: value for name, value in values.items() if name.startswith(_FORM) and value is not None}
+    of_forms = {name.removeprefix(_FORM): text for name, text in every.items()}
+    own: Any = fields(kind)  # type: ignore[arg-type]
+    return kind(**{one.name: of_forms if "forms" in one.metadata else values[one.name] for one in own})
 
 
 def flag(name: str) -> str:
@@ -348,37 +343,25 @@ def command(name: str, summary: str, *examples: str) -> Callable[[Callable[..., 
 # ---- the table ------------------------------------------------------------------------------------------------------
 
 
-_MODULES = {
-    "open": "open",
-    "run": "run",
-    "detect board": "photographs",
-    "detect rings": "photographs",
-    "detect field": "detect_field",
-    "join": "join",
-    "calibrate": "calibrate",
-    "diagnose": "diagnose",
-    "advise": "advise",
-    "refit": "moves",
-    "check": "moves",
-    "score": "moves",
-    "compare": "moves",
-    "audit": "moves",
-    "batch": "batch",
-    "locate": "locate",
-    "project": "locate",
-    "undistort": "undistort",
-    "export": "foreign",
-    "export-table": "foreign",
-    "import": "foreign",
-    "publish": "foreign",
-    "listen": "foreign",
-    "targets import": "foreign",
-    "simulate": "simulate",
-    "targets": "targets",
-    "targets print": "targets",
-    "completion": "completion",
+_COMMANDS_OF = {
+    "open": ("open",),
+    "run": ("run",),
+    "photographs": ("detect board", "detect rings"),
+    "detect_field": ("detect field",),
+    "join": ("join",),
+    "calibrate": ("calibrate",),
+    "diagnose": ("diagnose",),
+    "advise": ("advise",),
+    "moves": ("refit", "check", "score", "compare", "audit"),
+    "batch": ("batch",),
+    "locate": ("locate", "project"),
+    "undistort": ("undistort",),
+    "foreign": ("export", "export-table", "import", "publish", "listen", "targets import"),
+    "simulate": ("simulate",),
+    "targets": ("targets", "targets print"),
+    "completion": ("completion",),
 }
-
-
+"""Commands of each module, in the order of the help."""
+_MODULES = {name: module for module, names in _COMMANDS_OF.items() for name in names}
 COMMANDS: Mapping[str, Command] = LazyTable("ceres_cal.cli", _MODULES, Command)
 """All commands by name."""

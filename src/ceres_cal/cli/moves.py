@@ -242,25 +242,16 @@ def _compare(
     files.require_output(picture, [a, b], "pictures are", ".svg")
     first, second = files.read_calibration(a), files.read_calibration(b)
     if scene.still(first.targets) and not (over_image or without_turn):
-        return _over_field(first, second, arguments.metres(height_mm), station, picture)
-    if picture is not None or station is not None:
+        compared, shown_as = moves.compare(first, second, arguments.metres(height_mm), station), _compared_station
+    elif picture is not None or station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
-
-    comparisons = moves.compare_cameras(first, second, without_turn=without_turn)
-    return Document(tuple(section for one in comparisons.values() for section in _compared_camera(one)))
-
-
-def _over_field(
-    first: Calibration, second: Calibration, height_m: float, station: str | None, picture: Path | None
-) -> Document:
-    comparisons = moves.compare(first, second, height_m, station)
+    else:
+        compared, shown_as = moves.compare_cameras(first, second, without_turn=without_turn), _compared_camera
     if picture is not None:
-        if len(comparisons) > 1:
-            names = " or ".join(comparisons)
-            raise InputError(f"--picture shows one station: name it with --station {names}")
-
-        files.save(picture, report.comparison_svg(next(iter(comparisons.values())), first).encode())
-    return Document(tuple(section for one in comparisons.values() for section in _compared_station(one)))
+        if len(compared) > 1:
+            raise InputError(f"--picture shows one station: name it with --station {' or '.join(compared)}")
+        files.save(picture, report.comparison_svg(next(iter(compared.values())), first).encode())
+    return Document(tuple(section for one in compared.values() for section in shown_as(one)))
 
 
 def _compared_station(one: moves.Agreement) -> Iterator[Section]:

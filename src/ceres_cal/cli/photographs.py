@@ -129,9 +129,8 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
 
 
 def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, base.Image]]:
-    each = max(
-        1, detect.MOST_PICTURES // (len(videos) + bool(images))
-    )  # of each video, and of the photographs together
+    # of each video, and of the photographs together
+    each = max(1, detect.MOST_PICTURES // (len(videos) + bool(images)))
     for path in images[:: -(-len(images) // each) or 1]:
         yield str(path), detect.read_colour(path)
     for video in videos[: detect.MOST_PICTURES]:
@@ -217,7 +216,11 @@ def _run_board(args: BoardArguments) -> Document:
             args.timeout, partial(detect_board, args.images, _board(args), **how, progress=bar.update)
         )
     save(args.output, detections.observations)
-    return _document(detections, args.output)
+    corners, found, missed = len(detections.observations.points), detections.found, detections.missed
+    said = f"{len(found)} of {len(found) + len(missed)} images show the board, {corners} corners in all"
+    first = Section("", [said], {"corners": corners, "found": found})
+    written = Section("", [f"written to {args.output}"], {"output": str(args.output)})
+    return Document((first, missed_section(missed), written))
 
 
 _OF_A_BOARD = ("columns", "rows", "square", "april_grid", "gap", "circles", "diameter", "charuco", "marker")
@@ -243,18 +246,6 @@ def _board(args: BoardArguments) -> scene.Target:
         return scene.april_grid(args.columns, args.rows, args.april_grid, args.gap or 0.0)
     distance, diameter = args.circles or 0.0, args.diameter or 0.0
     return scene.circle_grid(args.columns, args.rows, distance, diameter, asymmetric=args.asymmetric)
-
-
-def _document(detections: detect.BoardDetections, output: Path) -> Document:
-    corners, found, missed = len(detections.observations.points), detections.found, detections.missed
-    said = f"{len(found)} of {len(found) + len(missed)} images show the board, {corners} corners in all"
-    return Document(
-        (
-            Section("", [said], {"corners": corners, "found": found}),
-            missed_section(missed),
-            Section("", [f"written to {output}"], {"output": str(output)}),
-        )
-    )
 
 
 def _radii(text: str) -> tuple[float, ...]:

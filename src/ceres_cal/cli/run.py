@@ -86,7 +86,8 @@ def _run(args: RunArguments) -> Document:
     steps = [step for own in seen for step in own]
     detected = [step.data for step in steps if "output" in step.data]
     observations = [str(data["output"]) for data in detected]
-    if several and _is_named_by_chance(args.board):
+    # A board that looks the same when turned by half a turn: cameras may name its corners differently.
+    if several and args.board is not None and len(start.symmetries(read_board(args.board))) > 1:
         steps.append(_attempted(args, "join", [*observations, "-o", str(args.output / "rig.json")]))
         observations = [str(steps[-1].data["output"])] if steps[-1].data else observations
     calibrated = _calibrated(args, cameras, detected, observations)
@@ -237,11 +238,6 @@ def _observed(args: RunArguments, images: list[Path], is_one_of_several: bool) -
         still = [] if images_and_videos(args.images)[0] else ["--median"]  # for videos only
         asked = [*rest, *still, "--target", args.target, "--auto", *said, *goal]
         yield _step(args, "detect field", asked, most=1)
-
-
-def _is_named_by_chance(board: str | None) -> bool:
-    """Whether a board looks the same when turned by half a turn, so that cameras may name its corners differently."""
-    return board is not None and len(start.symmetries(read_board(board))) > 1
 
 
 def _calibrated(

@@ -42,13 +42,12 @@ def _run(
     simulation = simulate(*(load_scene(scene) if is_file else built_in_scene(scene)), seed)
     with finishing():
         write_simulation(simulation, output)
-    data = _data(simulation, scene, output)
-    return Document((Section("", _lines(data), data),))
+    return Document((_section(simulation, scene, output),))
 
 
-def _data(simulation: simulate.Simulation, scene: str, folder: Path) -> dict[str, Any]:
+def _section(simulation: simulate.Simulation, scene: str, folder: Path) -> Section:
     observations, truths = simulation.observations, (simulation.points, simulation.curves)
-    return {
+    data: dict[str, Any] = {
         "scene": scene,
         "seed": simulation.seed,
         "observations": str(folder / "observations.json"),
@@ -59,10 +58,8 @@ def _data(simulation: simulate.Simulation, scene: str, folder: Path) -> dict[str
         "outliers": sum(len(truth.rows(simulate.OUTLIER)) for truth in truths),
         "wrong_labels": sum(len(truth.rows(simulate.WRONG_LABEL)) for truth in truths),
     }
-
-
-def _lines(data: dict[str, Any]) -> list[str]:
     kinds = (("views", "view"), ("points", "point observation"), ("curves", "curve observation"))
     seen = ", ".join(plural(data[name], word) for name, word in kinds)
     wrong = f"{plural(data['outliers'], 'outlier')} and {plural(data['wrong_labels'], 'wrong label')}"
-    return [f"{data['observations']}: {seen}, of them {wrong}", f"{data['truth']}: what is true of them"]
+    lines = [f"{data['observations']}: {seen}, of them {wrong}", f"{data['truth']}: what is true of them"]
+    return Section("", lines, data)

@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from select import select
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
 
 from ceres_cal import base, calibration
@@ -81,9 +81,7 @@ class ProgressBar:
     def __enter__(self) -> ProgressBar:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._terminal and not self._silent:
             self._write(_CLEAR)
 
