@@ -141,13 +141,10 @@ def _for_page(text: str) -> str:
     text = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in named else "", text)
     text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # implied in HTML
     text = re.sub(r' d="[^"]+"', lambda match: re.sub(r"(?<=\.\d\d)\d+", "", match[0]), text)  # a hundredth of a point
-    text = re.sub(r"#[0-9a-f]{6}\b", lambda match: _themed(match[0]), text)
+    themed = "|".join(_THEMED)
+    text = re.sub(rf"(?:{themed})\b", lambda match: f"var(--{_THEMED[match[0]]},{match[0]})", text)
     text = text.replace("xlink:href", "href")
     return re.sub(r"\n\s*", "\n", text).strip()
-
-
-def _themed(color: str) -> str:
-    return f"var(--{_THEMED[color]},{color})" if color in _THEMED else color
 
 
 # ---- many things in one path ----------------------------------------------------------------------------------------

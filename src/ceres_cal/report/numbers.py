@@ -121,15 +121,12 @@ def lens_choice(camera: str, choice: LensChoice) -> Section:
     for one in choice.tried:
         cells = (DASH, DASH, DASH, one.failed)
         if one.rms_px is not None and one.worse is not None:
-            cells = (fixed(one.rms_px, 4), fixed(one.worse, 1, "+"), _percent(one.probability), "")
+            share = DASH if one.probability is None else f"{100.0 * one.probability:.0f} %"
+            cells = (fixed(one.rms_px, 4), fixed(one.worse, 1, "+"), share, "")
         rows.append((one.label, str(one.coefficients), *cells))
     head = ("lens", "coefficients", "held-out px", "worse, standard errors", "predicts best, probability", "")
     table = Table(head, tuple(rows), sentence(f"{camera}the lens that the data ask for: {choice.chosen}"), stacked=True)
     return Section("lens", wrapped(camera + choice.words), pieces=(table,))
-
-
-def _percent(share: float | None) -> str:
-    return DASH if share is None else f"{100.0 * share:.0f} %"
 
 
 # ---- cameras and stations -------------------------------------------------------------------------------------------

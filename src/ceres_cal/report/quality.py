@@ -286,9 +286,8 @@ class Material(Quality):
         if not self.calibration.rounds:
             return "this calibration is the closed form itself"
         options = replace(self.calibration.options, closed_form_only=True)
-        calibration = attempt(
-            lambda: calibrate(self.observations, options)
-        )  # reads: "..." in place of the paper's method
+        # reads: "..." in place of the paper's method
+        calibration = attempt(lambda: calibrate(self.observations, options))
         if isinstance(calibration, CalibrationError):
             return str(calibration)
         remaining = residuals(gather_sights(self.observations), calibration.estimate)

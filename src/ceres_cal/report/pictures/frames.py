@@ -32,17 +32,12 @@ class Frame(Frozen, eq=True):
 
 def frames_of(observations: Observations) -> tuple[Frame, ...]:
     """Return the frames of each station, in the order of their views."""
-    rows_of: dict[tuple[str, str], list[int]] = {}
-    for number, view in enumerate(observations.views):
+    views, rows_of = observations.views, dict[tuple[str, str], list[int]]()
+    for number, view in enumerate(views):
         rows_of.setdefault((view.frame, view.station), []).append(number)
     return tuple(
-        Frame(
-            name,
-            station,
-            tuple((view.target, view.placement) for view in map(observations.views.__getitem__, rows)),
-            tuple(rows),
-        )
-        for (name, station), rows in rows_of.items()
+        Frame(*names, tuple((views[row].target, views[row].placement) for row in rows), tuple(rows))
+        for names, rows in rows_of.items()
     )
 
 
