@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 
@@ -102,10 +103,8 @@ class Ground(Frozen):
         targets = {**self.targets, **measurement.targets}
         estimate = self._with(measurement, targets)
         observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
-        sights, layout = (
-            gather_sights(observations, predicted=True),
-            layout_of(self.keys, estimate, measurement.placements),
-        )
+        sights = gather_sights(observations, predicted=True)
+        layout = layout_of(self.keys, estimate, measurement.placements)
         if len(sights):  # a measurement sees few of the hundreds of nodes of a surface
             seen = np.any(equations_of(sights, estimate, residuals(sights, estimate)).intrinsics != 0.0, axis=0)
             layout = replace(layout, free={name: own[seen[own]] for name, own in layout.free.items()})
@@ -279,32 +278,23 @@ def boards(search: CandidateSearch) -> Iterator[Measurement]:
     name, board = search.board
     camera, size = search.camera, np.array(search.camera.image_size, dtype=float)
     diagonal = float(np.linalg.norm(np.ptp(board.point_array, axis=0)))
-    for share in board_sizes:
+    pixels = [np.round(size * place) for place in product(board_places, repeat=2)]
+    middles = [(pixel, camera.rays(pixel[None])[0]) for pixel in pixels]
+    every = product(board_sizes, middles, board_tilts_deg, enumerate(_NEARER))
+    for share, (pixel, line_of_sight), tilt, (quarter, edge) in every:
         distance = camera.phi * diagonal / (share * float(size.min()))
-        for column in board_places:
-            for row in board_places:
-                pixel = np.round(size * (column, row))
-                line_of_sight = camera.rays(pixel[None])[0]
-                for tilt in board_tilts_deg:
-                    for quarter, edge in enumerate(_NEARER):
-                        turn = (np.deg2rad(tilt), 0.5 * np.pi * quarter, 0.0)
-                        pose = board_pose(board, line_of_sight, distance, turn)
-                        held = camera.cam_from_world.inverse @ pose
-                        corners = held.transform(board.point_array)
-                        if np.min(corners[:, 2]) < least_height_m or not np.all(well_inside(camera, corners)):
-                            continue
-                        label = f"advised_{share:.1f}_{pixel[0]:.0f}_{pixel[1]:.0f}_{tilt:.0f}_{edge}"
-                        words = (
-                            f"middle at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), {distance:.2f} m from the camera, "
-                            f"tilted by {tilt:.0f} deg with its {edge} edge nearer"
-                        )
-                        yield Measurement(
-                            "board",
-                            words,
-                            targets={name: board},
-                            placements={label: held},
-                            views=(ViewPlan((label,), search.station, name, label),),
-                        )
+        turn = (np.deg2rad(tilt), 0.5 * np.pi * quarter, 0.0)
+        held = camera.cam_from_world.inverse @ board_pose(board, line_of_sight, distance, turn)
+        corners = held.transform(board.point_array)
+        if np.min(corners[:, 2]) < least_height_m or not np.all(well_inside(camera, corners)):
+            continue
+        label = f"advised_{share:.1f}_{pixel[0]:.0f}_{pixel[1]:.0f}_{tilt:.0f}_{edge}"
+        words = (
+            f"middle at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), {distance:.2f} m from the camera, tilted by "
+            f"{tilt:.0f} deg with its {edge} edge nearer"
+        )
+        view = ViewPlan((label,), search.station, name, label)
+        yield Measurement("board", words, targets={name: board}, placements={label: held}, views=(view,))
 
 
 # ---- the field's own curves -----------------------------------------------------------------------------------------
