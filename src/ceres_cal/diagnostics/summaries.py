@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 
@@ -101,13 +102,8 @@ def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
     sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
     counts = np.stack([count(points), count(curves), count(table.outlier)])
     filled = np.flatnonzero(counts.sum(axis=0))
-    measures = (
-        rms(points, table.distance_px),
-        rms(curves, table.distance_px),
-        rms(inlier, table.error_mm),
-        rms(inlier, sigmas),
-    )
-    return Summary(tuple(names[i] for i in filled), *counts[:, filled], *(one[filled] for one in measures))
+    measured = (points, table.distance_px), (curves, table.distance_px), (inlier, table.error_mm), (inlier, sigmas)
+    return Summary(tuple(names[i] for i in filled), *counts[:, filled], *(rms(*one)[filled] for one in measured))
 
 
 def _regions(
@@ -129,9 +125,7 @@ def _rings(
     for number, name in enumerate(names):
         own = camera == number
         ring[own] = number * RADIUS_BINS + _ring_of(table.radius_px[own], edges[number])
-        labels += [
-            f"{name} {low:.0f}-{high:.0f} px" for low, high in zip(edges[number], edges[number][1:], strict=False)
-        ]
+        labels += [f"{name} {low:.0f}-{high:.0f} px" for low, high in pairwise(edges[number])]
     return labels, ring, edges
 
 
