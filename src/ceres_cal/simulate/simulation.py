@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Codes, Frozen, Indices, Indices32, Mask, replace
+from ceres_cal.base import Array, Codes, Frozen, Indices, Indices32, Mask, numbers_of, replace
 from ceres_cal.observations import Curves, Observations, Points, View, joined, taken
 from ceres_cal.scene import SIDES, Camera, Target, along_curve, distance_to_curve, in_image, is_crossing
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -79,14 +79,15 @@ def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0
     point_rows, curve_rows = [], []
     for plan in scene.views:
         camera = scene.camera_at(plan.station)
-        points, curves = _points_in_view(scene, plan, camera), _curves_in_view(scene, plan, camera)
-        hidden_points = _hidden_points(points, len(plan.frames), disturbance, point_rng)
-        hidden_curves = _hidden_stretches(curves, len(plan.frames), disturbance, curve_rng)
-        point_rows.append(_observe(points, hidden_points, len(views), disturbance, point_rng))
-        curve_rows.append(_observe(curves, hidden_curves, len(views), disturbance, curve_rng))
+        some_points, some_curves = _points_in_view(scene, plan, camera), _curves_in_view(scene, plan, camera)
+        hidden_points = _hidden_points(some_points, len(plan.frames), disturbance, point_rng)
+        hidden_curves = _hidden_stretches(some_curves, len(plan.frames), disturbance, curve_rng)
+        point_rows.append(_observe(some_points, hidden_points, len(views), disturbance, point_rng))
+        curve_rows.append(_observe(some_curves, hidden_curves, len(views), disturbance, curve_rng))
         camera_name = scene.stations[plan.station].camera
         views.extend(View(frame, camera_name, plan.station, plan.target, plan.placement) for frame in plan.frames)
-    return _assemble(scene, disturbance, seed, views, point_rows, curve_rows)
+    (points, of_points), (curves, of_curves) = _joined(point_rows), _joined(curve_rows)
+    return Simulation(scene, disturbance, seed, _observations(scene, views, points, curves), of_points, of_curves)
 
 
 # ---- what can be seen -----------------------------------------------------------------------------------------------
@@ -102,10 +103,7 @@ def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -
 
 
 def _chosen(names: tuple[str, ...] | None, known: tuple[str, ...]) -> Indices32:
-    if names is None:
-        return np.arange(len(known), dtype=np.int32)
-    index = {name: i for i, name in enumerate(known)}
-    return np.array(sorted(index[name] for name in names), dtype=np.int32)
+    return np.sort(numbers_of(known if names is None else names, known)).astype(np.int32)
 
 
 def _points_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
@@ -218,27 +216,19 @@ def _mislabel(in_view: _InView, place: Indices, flag: Codes, rng: np.random.Gene
 # ---- all together ---------------------------------------------------------------------------------------------------
 
 
-def _assemble(
-    scene: Scene,
-    disturbance: Disturbance,
-    seed: int,
-    views: Sequence[View],
-    point_rows: Sequence[_Rows],
-    curve_rows: Sequence[_Rows],
-) -> Simulation:
-    (points, of_points), (curves, of_curves) = _joined(point_rows), _joined(curve_rows)
+def _observations(scene: Scene, views: Sequence[View], points: Curves, curves: Curves) -> Observations:
+    """Return the rows of points and of curves as observations, with the views that have any."""
     used = np.zeros(len(views), dtype=bool)
     used[points.view] = used[curves.view] = True
     number = (np.cumsum(used) - 1).astype(np.int32)
     kept_views = tuple(view for view, keep in zip(views, used, strict=True) if keep)
-    observations = Observations(
+    return Observations(
         {name: target for name, target in scene.targets.items() if any(view.target == name for view in kept_views)},
         {name: camera.image_size for name, camera in scene.cameras.items()},
         kept_views,
         Points(number[points.view], points.feature, points.pixels, points.sigma_px),
         replace(curves, view=number[curves.view]),
     )
-    return Simulation(scene, disturbance, seed, observations, of_points, of_curves)
 
 
 def _joined(parts: Sequence[_Rows]) -> _Rows:
