@@ -206,11 +206,7 @@ def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> Non
 def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
     """Apply `require_output` to output and report; they must be two files, and the report must end like a page."""
     require_output(args.output, inputs)
-    if (
-        args.output is not None
-        and args.report is not None
-        and os.path.realpath(args.output) == os.path.realpath(args.report)
-    ):
+    if args.output and args.report and os.path.realpath(args.output) == os.path.realpath(args.report):
         raise InputError(f"{args.report}: is named as output and as report: give them two names")
     require_output(args.report, inputs, "a report is", ".html", ".htm")
 

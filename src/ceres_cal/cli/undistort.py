@@ -111,10 +111,10 @@ def _run(args: UndistortArguments) -> Document:
             lines.append(f"{output}: {line}")
             written.append({"image": str(path), "output": str(output), **own})
             bar.update(number, len(outputs), path.name)
-    data = {"format": format, "version": version, "calibration": str(args.calibration), "kind": kind, **facts}
-    save(about, {**data, "pictures": written})
-    said = {**data, "pictures": written, "output": str(about)}
-    return Document((Section("", [*lines, f"{about}: {words}"], said),))
+    first = {"format": format, "version": version, "calibration": str(args.calibration), "kind": kind}
+    data = {**first, **facts, "pictures": written}
+    save(about, data)
+    return Document((Section("", [*lines, f"{about}: {words}"], {**data, "output": str(about)}),))
 
 
 # ---- options --------------------------------------------------------------------------------------------------------
@@ -169,21 +169,21 @@ def _read(path: Path, camera: scene.Camera, name: str) -> Image:
 def _write(path: Path, picture: Image) -> None:
     jpeg_quality = 95
 
-    content = detect.encoded(
-        report.in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, jpeg_quality
-    )
-    save(path, content)
+    picture = report.in_8_bit_colour(picture) if path.suffix == ".jpg" else picture
+    save(path, detect.encoded(picture, path.suffix, jpeg_quality))
 
 
 def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     name, station, camera = _camera(args, calibration)
     straight = report.straighten(camera, whole=args.whole, size=args.size, phi=args.phi, angle_deg=args.angle)
+    pose = straight.camera.cam_from_world
+    posed = {"rotation": pose.rotation, "translation_m": pose.translation, "position_m": pose.position}
     facts = {
         "camera": name,
         "station": station,
         "matrix": straight.camera.matrix.tolist(),
         **scene.camera_to_json(straight.camera),
-        **({} if station is None else _pose(straight.camera)),
+        **({} if station is None else posed),
         "view_deg": list(straight.view_deg),
         "shown": straight.share,
         "limit_deg": straight.limit_deg,
@@ -204,15 +204,6 @@ def _straight_line(straight: report.Straightening, whole: bool) -> str:
         f"{100.0 * straight.share:.1f} % of the photograph, {_black(straight.warp.size, straight.warp.black)}"
         + (f"; nothing from {straight.limit_deg:.1f} degrees off the axis on" if ends else "")
     )
-
-
-def _pose(camera: scene.Camera) -> dict[str, Any]:
-    pose = camera.cam_from_world
-    return {
-        "rotation": pose.rotation.tolist(),
-        "translation_m": pose.translation.tolist(),
-        "position_m": pose.position.tolist(),
-    }
 
 
 def _black(size: tuple[int, int], count: int) -> str:

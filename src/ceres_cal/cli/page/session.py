@@ -111,7 +111,9 @@ class Session:
 
     def drag(self, drag: Drag) -> None:
         """Move a point or place with the pointer; earlier results are dropped, since they belong to other clicks."""
-        target = self._required_target()
+        target = self.target(self.state)
+        if target is None:
+            raise InputError("choose the field first, such as ssl-b")
         state = drag.of(self.state, target)
         base = self._base(target)
         self._camera = detect.by_hand.solved(_shown(state, target), self._camera or base, base, quickly=True)
@@ -152,19 +154,9 @@ class Session:
         elif target is not None:
             self._camera = self._now.base
         self._by_hand = None
-        self._keep()
-
-    def _keep(self) -> None:
-        """Save the state; if that fails, the window, which still has everything, says so."""
-        folder, state = self.sitting.folder, self.state
-        _, unkept = answer_or_reason(lambda: save_state(make_folder(folder) / KEPT, state))
+        # If saving fails, the window, which still has everything, says so.
+        _, unkept = answer_or_reason(lambda: save_state(make_folder(self.sitting.folder) / KEPT, self.state))
         self.message = self.message or unkept
-
-    def _required_target(self) -> scene.Target:
-        target = self.target(self.state)
-        if target is None:
-            raise InputError("choose the field first, such as ssl-b")
-        return target
 
     # ---- work that takes seconds ----
 
