@@ -173,13 +173,8 @@ def _of_faults(quality: Quality) -> tuple[str, str]:
     """Return level and line of the model's faults, by how far they move a result."""
     sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
     left_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
-    level = (
-        ""
-        if sigmas < MOVED
-        else "no"
-        if sigmas >= MOVED_FAR and level_of(left_mm, paint_over_usual(quality)) != "good"
-        else "care"
-    )
+    far = sigmas >= MOVED_FAR and level_of(left_mm, paint_over_usual(quality)) != "good"
+    level = "no" if far else "care" if sigmas >= MOVED else ""
     counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
     moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} standard deviations"
     wrong_mm = mm(_largest_mm(quality.faults))

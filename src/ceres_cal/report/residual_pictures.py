@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, Indices, InputError, Mask, fixed, grouped, no_such, short
 from ceres_cal.diagnostics import Diagnosis, ResidualTable
@@ -277,16 +276,16 @@ def by_frame(material: Material) -> Figure:
     """Make the figure of each frame's root mean square residual, in standard deviations."""
     frames = material.diagnosis.summaries.frames
     number = np.arange(len(frames.names), dtype=float)
-    few = len(number) <= _MOST_FRAMES_NAMED
+    heads, few = np.column_stack([number, frames.rms_sigma]), len(number) <= _MOST_FRAMES_NAMED
     top = 1.25 * float(np.nanmax(frames.rms_sigma, initial=1.0))
 
     def draw(axes: Axes, width_in: float) -> None:
         axes.axhline(1.0, color=QUIET, linewidth=0.9)
         if few:
-            canvas.strokes(axes, _at(number, 0.0 * number), _at(number, frames.rms_sigma), PAINT, 1.4)
+            canvas.strokes(axes, np.column_stack([number, 0.0 * number]), heads, PAINT, 1.4)
             names = [_clipped(name) for name in frames.names]
             axes.set_xticks(number, names, rotation=60, ha="right", rotation_mode="anchor", fontsize=6.5)
-        canvas.dots(axes, _at(number, frames.rms_sigma), POINT, 5.0 if few else 2.5)
+        canvas.dots(axes, heads, POINT, 5.0 if few else 2.5)
         axes.grid(visible=False, axis="x")
         axes.set(ylim=(0.0, top), xlim=(-0.7, len(number) - 0.3), ylabel="rms, in standard deviations")
         if not few:
@@ -301,10 +300,6 @@ def by_frame(material: Material) -> Figure:
         summary_table("frame", frames, range(len(frames.names))),
         hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
     )
-
-
-def _at(x: Array, y: ArrayLike) -> Array:
-    return np.column_stack([x, y])
 
 
 def _clipped(name: str) -> str:

@@ -193,11 +193,9 @@ def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
 def _border(size: tuple[int, int]) -> Array:
     """Pixels (N, 2) along the border of an image, half a pixel outside of its outermost centres."""
     border_step_px = 0.25
-    width, height = size
-    x = np.linspace(-0.5, width - 0.5, int(width / border_step_px) + 1)
-    y = np.linspace(-0.5, height - 0.5, int(height / border_step_px) + 1)
-    sides = [np.column_stack([x, np.full(len(x), end)]) for end in (-0.5, height - 0.5)]
-    sides += [np.column_stack([np.full(len(y), end), y]) for end in (-0.5, width - 0.5)]
+    x, y = (np.linspace(-0.5, side - 0.5, int(side / border_step_px) + 1) for side in size)
+    sides = [np.column_stack([x, np.full(len(x), end)]) for end in y[[0, -1]]]
+    sides += [np.column_stack([np.full(len(y), end), y]) for end in x[[0, -1]]]
     return np.concatenate(sides)
 
 
