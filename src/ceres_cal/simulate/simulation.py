@@ -76,14 +76,13 @@ def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0
     disturbance = disturbance or Disturbance()
     point_rng, curve_rng = np.random.default_rng(seed).spawn(2)
     views: list[View] = []
-    point_rows, curve_rows = [], []
+    point_rows, curve_rows = list[_Rows](), list[_Rows]()
     for plan in scene.views:
         camera = scene.camera_at(plan.station)
         some_points, some_curves = _points_in_view(scene, plan, camera), _curves_in_view(scene, plan, camera)
-        hidden_points = _hidden_points(some_points, len(plan.frames), disturbance, point_rng)
-        hidden_curves = _hidden_stretches(some_curves, len(plan.frames), disturbance, curve_rng)
-        point_rows.append(_observe(some_points, hidden_points, len(views), disturbance, point_rng))
-        curve_rows.append(_observe(some_curves, hidden_curves, len(views), disturbance, curve_rng))
+        for in_view, rng, rows in ((some_points, point_rng, point_rows), (some_curves, curve_rng, curve_rows)):
+            hidden = _hidden(in_view, len(plan.frames), disturbance, rng)
+            rows.append(_observe(in_view, hidden, len(views), disturbance, rng))
         camera_name = scene.stations[plan.station].camera
         views.extend(View(frame, camera_name, plan.station, plan.target, plan.placement) for frame in plan.frames)
     (points, of_points), (curves, of_curves) = _joined(point_rows), _joined(curve_rows)
@@ -151,17 +150,11 @@ def _neighbours(target: Target, feature: Indices32, places: Array) -> Indices32:
 # ---- what is seen ---------------------------------------------------------------------------------------------------
 
 
-def _hidden_points(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Mask:
-    """(frames, N) which points are hidden."""
-    shape = frames, len(in_view.feature)
-    if disturbance.hidden_points == 0.0:
-        return np.zeros(shape, dtype=bool)
-    return rng.random(shape) < disturbance.hidden_points
-
-
-def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Mask:
-    """(frames, N) which places on curves are hidden; each stretch is centred on one of the places in view."""
+def _hidden(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Mask:
+    """(frames, N) which points or places on curves are hidden; a stretch is centred on one of the places in view."""
     count, stretches, position = len(in_view.feature), disturbance.hidden_stretches, in_view.position_m
+    if position is None and disturbance.hidden_points > 0.0:
+        return rng.random((frames, count)) < disturbance.hidden_points
     if position is None or count == 0 or stretches == 0:
         return np.zeros((frames, count), dtype=bool)
     middle = rng.integers(count, size=(frames, stretches))
