@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal import diagnostics, observations, scene
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.words import short
+from ceres_cal.base import InputError, naming, short
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, command, option
 from ceres_cal.cli.files import read_calibration, station_of
@@ -108,24 +107,13 @@ def _mm(value: float) -> str:
 
 
 def _promise_data(promise: diagnostics.Promise) -> dict[str, Any]:
-    return {
-        **_measurement_data(promise.measurement),
-        **vars(promise.after),
-        "worst_range_mm": list(promise.worst_range_mm),
-        "rough": promise.rough,
-        "over_phi": [{"phi_px": phi, **vars(errors)} for phi, errors in promise.valley],
-    }
-
-
-def _measurement_data(measurement: diagnostics.Measurement) -> dict[str, Any]:
-    """Return the measurement in the form of files of observations."""
-    return {
-        "kind": measurement.kind,
-        "words": measurement.words,
-        "steps": list(measurement.steps),
+    """Return a promise, with its measurement in the form of files of observations."""
+    measurement = promise.measurement
+    as_in_files = {
         "priors": [observations.prior_to_json(prior) for prior in measurement.priors],
         "targets": {name: target.spec for name, target in measurement.targets.items()},
-        "tolerances": measurement.tolerances,
         "placements": {name: scene.PoseFile.of(pose) for name, pose in measurement.placements.items()},
-        "views": measurement.views,
     }
+    over_phi = [{"phi_px": phi, **vars(errors)} for phi, errors in promise.valley]
+    reach = {"worst_range_mm": promise.worst_range_mm, "rough": promise.rough, "over_phi": over_phi}
+    return {**vars(measurement), **as_in_files, **vars(promise.after), **reach}

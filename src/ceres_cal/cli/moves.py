@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import base, detect, formats, moves, report, scene
-from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace, short
-from ceres_cal.base.words import plural
+from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, plural, replace, short
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch, whole
 from ceres_cal.cli.foreign import from_option, import_options, typed_options
@@ -135,15 +134,10 @@ def _scored(answer: moves.Agreements, before: Calibration) -> Document:
         "calibration_rms_px": before.fit.rms_px,
         "noise_ratios": ratios,
     }
-    worst = [f"{one.name}: {_left(one)}" for one in views[:most_views]]
     parts = {"cameras": list(map(_misfit_data, cameras)), "views": list(map(_misfit_data, views))}
-    return Document(
-        (
-            Section("score", [*(f"{one.name} {one.words}" for one in cameras), *known], numbers),
-            *(Section("camera", [f"{one.name}: {_left(one)}"]) for one in cameras),
-            Section("worst", worst, parts),
-        )
-    )
+    first = Section("score", [*(f"{one.name} {one.words}" for one in cameras), *known], numbers)
+    worst = Section("worst", list(map(_left, views[:most_views])), parts)
+    return Document((first, *(Section("camera", [_left(one)]) for one in cameras), worst))
 
 
 def _misfit_data(one: moves.Agreement) -> dict[str, Any]:
@@ -162,7 +156,7 @@ def _left(one: moves.Agreement) -> str:
         if count
     ]
     out = f"; {left.outliers} taken out, {left.all_rms_px:.4f} px with them" if left.outliers else ""
-    return ", ".join(kinds or ["nothing took part"]) + out
+    return f"{one.name}: {', '.join(kinds or ['nothing took part'])}{out}"
 
 
 # ---- may the calibration of another program be trusted ---------------------------------------------------------------
@@ -185,18 +179,10 @@ def _audit(
     ours = form is None and file.suffix == ".json" and b"ceres-cal/calibration" in base.read_bytes(file)[:4096]
     given = Calibration.load(file) if ours else formats.import_calibration(file, form, **typed_options(options, form))
     stations = moves.audit(given, files.read_observations(observations))
-    return Document(
-        (
-            Section(
-                "audit",
-                ["yes" if stations.holds else "no"],
-                {"trusted": stations.holds, "warnings": list(given.warnings)},
-            ),
-            *map(_audited_station, stations.values()),
-            *(Section("warning", wrapped(text)) for text in given.warnings),
-        ),
-        stations.exit_code,
-    )
+    stated = {"trusted": stations.holds, "warnings": list(given.warnings)}
+    first = Section("audit", ["yes" if stations.holds else "no"], stated)
+    warnings = (Section("warning", wrapped(text)) for text in given.warnings)
+    return Document((first, *map(_audited_station, stations.values()), *warnings), stations.exit_code)
 
 
 def _audited_station(one: moves.Agreement) -> Section:
@@ -349,13 +335,8 @@ def _refit(args: RefitArguments) -> Document:
     assert observations is not None
 
     photographs = files.report_photographs(args, observations, calibration, images)
-    result = moves.refit(
-        calibration,
-        observations,
-        args.what,
-        moved=args.moved or None,
-        options=moves.RefitOptions(args.hold_others, args.labels, priors),
-    )
+    options = moves.RefitOptions(args.hold_others, args.labels, priors)
+    result = moves.refit(calibration, observations, args.what, moved=args.moved or None, options=options)
     about = result.refitted
     assert about is not None
     every = moves.movements(calibration, result, about.what).items()

@@ -111,25 +111,17 @@ def advise(
     informations = list(each(partial(added_information, ground=ground, outlook=outlook), candidates, executor=executor))
     promises = []
     one_promise = partial(_promise, ground=ground, outlook=outlook)
-    for number, promise in enumerate(each(one_promise, candidates, informations, executor=executor), start=1):
+    for promise in each(one_promise, candidates, informations, executor=executor):
         promises.append(promise)
         if progress is not None:
-            progress(number, len(candidates), promise.measurement.words)
+            progress(len(promises), len(candidates), promise.measurement.words)
     enough = 0.0 if good_enough_mm is None else good_enough_mm
-    best = _chosen(promises, outlook.before, enough)
-    then = None if best is None else _next(best, candidates, informations, outlook, enough)
-    ranked = sorted(promises, key=lambda promise: (promise.after.worst_mm, promise.after.mean_mm))
-    today = outlook.today
-    return Advice(
-        today.station,
-        height_m,
-        outlook.before,
-        today.worst_place_m,
-        tuple(ranked),
-        None if best is None else promises[best],
-        then,
-        good_enough_mm,
-    )
+    number, today = _chosen(promises, outlook.before, enough), outlook.today
+    best = None if number is None else promises[number]
+    then = None if number is None else _next(number, candidates, informations, outlook, enough)
+    ranked = tuple(sorted(promises, key=lambda promise: (promise.after.worst_mm, promise.after.mean_mm)))
+    place_m = today.worst_place_m
+    return Advice(today.station, height_m, outlook.before, place_m, ranked, best, then, good_enough_mm)
 
 
 def promised(
