@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal import formats, scene
-from ceres_cal.base import InputError, replace
-from ceres_cal.base.words import plural
+from ceres_cal.base import InputError, plural, replace
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
 from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch, whole
 from ceres_cal.cli.files import read_calibration, require_output, save

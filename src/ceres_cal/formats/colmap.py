@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base import Array, InputError, Pose, kept_signals, read_bytes
-from ceres_cal.base.words import plural
+from ceres_cal.base import Array, InputError, Pose, kept_signals, plural, read_bytes
 from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera, camera_matrix
@@ -109,7 +108,7 @@ def _read(request: ImportRequest) -> Any:
         cameras[name] = _foreign(image.camera, Pose(pose.rotation.matrix(), pose.translation))
     if not cameras:
         raise InputError("none of its images has a pose")
-    stems = {_stem(name): camera for name, camera in cameras.items()}
+    stems = {Path(name).stem if Path(name).suffix else name: camera for name, camera in cameras.items()}
     # Otherwise images in different folders have the same name: whole names distinguish them.
     if len(stems) == len(cameras):
         cameras = stems
@@ -122,11 +121,6 @@ def _name(image: Any) -> str:
         return str(image.name)
     except UnicodeDecodeError:
         raise InputError(f"the name of image {image.image_id} is not UTF-8: rename it") from None
-
-
-def _stem(name: str) -> str:
-    path = Path(name)
-    return path.stem if path.suffix else name
 
 
 def _foreign(camera: Any, pose: Pose) -> ForeignCamera:

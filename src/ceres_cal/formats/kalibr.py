@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base import Array, InputError, Pose, require_rotation
-from ceres_cal.base.words import plural
+from ceres_cal.base import Array, InputError, Pose, plural, require_rotation
 from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text

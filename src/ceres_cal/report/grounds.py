@@ -12,8 +12,7 @@ from msgspec import Struct
 
 from ceres_cal.base import HEIGHTS_M, counted, ended, first_of, median, mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics import Finding
-from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.diagnostics import Finding, ResidualTable
 from ceres_cal.posterior import FieldMap, Verdict
 from ceres_cal.report.quality import Quality
 from ceres_cal.robust.as_built import words_of

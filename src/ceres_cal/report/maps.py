@@ -16,13 +16,12 @@ from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.quality import Material, image_border, paint_of
 from ceres_cal.report.residual_pictures import counts_of_parts, number_of, owner_suffix
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
-from ceres_cal.scene import still
+from ceres_cal.scene import Camera, Target, still
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from ceres_cal.moves.agreement import Agreement
-    from ceres_cal.scene import Camera, Target
 
 _SERIES = (
     (1.0, 2.0, 5.0),

@@ -20,8 +20,7 @@ from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.findings import summary_table
 from ceres_cal.report.quality import Material, paint_of
 from ceres_cal.report.scale import spoken
-from ceres_cal.scene import still
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene import Camera, still
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
