@@ -91,31 +91,17 @@ def field_of(target: Target) -> dict[str, Any]:
         raise InputError("the target has no lines: it is not a field")
     reach = samples(curves.values())
     length, width = (round(2e3 * float(np.max(np.abs(reach[:, axis])))) for axis in (0, 1))
-    sizes = {
-        **_sizes_of(ssl_field(_division_of(length))),
-        "field_length": length,
-        "field_width": width,
-        **_RULES,
-        **_sizes_of(target),
-    }
-    lines = [
-        {"name": name, "p1": _place(c.start), "p2": _place(c.end), "thickness": _mm(c.width_m), **_type(name)}
-        for name, c in curves.items()
-        if isinstance(c, Segment)
-    ]
-    arcs = [
-        {
-            "name": name,
-            "center": _place(c.centre),
-            "radius": _mm(c.radius_m),
-            "a1": c.from_rad,
-            "a2": c.to_rad,
-            "thickness": _mm(c.width_m),
-            **_type(name),
-        }
-        for name, c in curves.items()
-        if isinstance(c, Arc)
-    ]
+    by_rule = _sizes_of(ssl_field(_division_of(length)))
+    sizes = {**by_rule, "field_length": length, "field_width": width, **_RULES, **_sizes_of(target)}
+    lines, arcs = [], []
+    for name, curve in curves.items():
+        paint = {"thickness": _mm(curve.width_m), **_type(name)}
+        if isinstance(curve, Segment):
+            lines.append({"name": name, "p1": _place(curve.start), "p2": _place(curve.end), **paint})
+        else:
+            angles = {"a1": curve.from_rad, "a2": curve.to_rad}
+            circle = {"center": _place(curve.centre), "radius": _mm(curve.radius_m)}
+            arcs.append({"name": name, **circle, **angles, **paint})
     return {**sizes, "field_lines": lines, "field_arcs": arcs}
 
 

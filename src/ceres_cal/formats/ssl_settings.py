@@ -6,7 +6,7 @@ settings.xml. ssl-vision reads it at its start and overwrites it at its end: edi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape
@@ -90,10 +90,7 @@ def values_in(content: bytes) -> list[_Var]:
 
 def _cameras(values: list[_Var]) -> dict[int, dict[str, _Var]]:
     """Return camera index -> the values of its Camera Parameters by name, and those beside them."""
-    groups: dict[int, dict[str, _Var]] = {}
-    for one in values:
-        if _PARAMETERS in one.path and one.path[-2] == _PARAMETERS:
-            groups.setdefault(one.owner, {})[one.path[-1]] = one
+    groups = _by_list(one for one in values if _PARAMETERS in one.path and one.path[-2] == _PARAMETERS)
     owners = sorted(groups)
     if not owners:
         raise InputError(
@@ -108,6 +105,14 @@ def _cameras(values: list[_Var]) -> dict[int, dict[str, _Var]]:
         number = place if index is None else int(_number(index))
         cameras[number] = {**beside, **groups[owner]}
     return cameras
+
+
+def _by_list(values: Iterable[_Var]) -> dict[int, dict[str, _Var]]:
+    """Return number of a list -> the values in it by name."""
+    groups: dict[int, dict[str, _Var]] = {}
+    for one in values:
+        groups.setdefault(one.owner, {})[one.path[-1]] = one
+    return groups
 
 
 def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
@@ -199,11 +204,7 @@ def settings_target(values: list[_Var]) -> Target:
 
 def _shapes(inside: list[_Var], of: str) -> list[dict[str, Any]]:
     """Return lines or arcs in the form of the message."""
-    groups: dict[int, dict[str, _Var]] = {}
-    for one in inside:
-        if of in one.path[:-1]:
-            groups.setdefault(one.owner, {})[one.path[-1]] = one
-    return [_shape(group) for group in groups.values()]
+    return [_shape(group) for group in _by_list(one for one in inside if of in one.path[:-1]).values()]
 
 
 def _shape(group: Mapping[str, _Var]) -> dict[str, Any]:
