@@ -148,20 +148,16 @@ def make_lookup_table(
 
 def _table(camera: scene.Camera, station: str, step: int, x_m: Array, y_m: Array) -> LookupTable:
     x, y = (step * np.arange(-1, int(np.ceil((size - 0.5) / step)) + 1, dtype=float) for size in camera.image_size)
+    # Where the nodes' rays meet the floor, and the change of this place with height.
+    floor = camera.locate(grid_places(x, y))
+    slope = (camera.position[:2] - floor) / camera.position[2]
+    rays = [plane.reshape(len(y), len(x), 2) for plane in (floor, slope)]
     flat = camera.homography(), np.array(camera.cam_from_world.rotation[:, 2])
-    plain = LookupTable(station, camera.image_size, step, x, y, *_rays(camera, x, y), {}, *flat)
+    plain = LookupTable(station, camera.image_size, step, x, y, rays[0], rays[1], {}, *flat)
     pixels = grid_places(x[:-1] + 0.5 * step, y[:-1] + 0.5 * step)
     inside = in_image(pixels, camera.image_size)
     errors = field_error_mm(camera, plain.locate, pixels[inside], (x_m, y_m), HEIGHTS_M)
     return replace(plain, error_mm=errors)
-
-
-def _rays(camera: scene.Camera, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return where the nodes' rays meet the floor, and the change of this place with height, (Y, X, 2) each."""
-    floor = camera.locate(grid_places(x, y))
-    slope = (camera.position[:2] - floor) / camera.position[2]
-    shape = (len(y), len(x), 2)
-    return floor.reshape(shape), slope.reshape(shape)
 
 
 # ---- as an export format --------------------------------------------------------------------------------------------
@@ -178,12 +174,9 @@ def _export(
     (station,), box = request.stations, posterior.field_grid(request.calibration.targets)
     table = make_lookup_table(request.calibration.station(station), station, *box, error_mm, step_px)
     nodes = (len(table.x_px), len(table.y_px))
-    return Export(
-        table.to_bytes(),
-        (ExportLoss(station, table.error_mm),),
-        f"{nodes[0]} x {nodes[1]} nodes every {table.step_px} px",
-        {"station": station, "step_px": table.step_px, "nodes": nodes},
-    )
+    facts = {"station": station, "step_px": table.step_px, "nodes": nodes}
+    words = f"{nodes[0]} x {nodes[1]} nodes every {table.step_px} px"
+    return Export(table.to_bytes(), (ExportLoss(station, table.error_mm),), words, facts)
 
 
 FORMATS = (ExportFormat("table", "a look-up table from pixels to the field", (".npz",), _export),)

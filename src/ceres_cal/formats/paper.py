@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, InputError, Pose, euler_from_rotation
 from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
@@ -20,17 +21,16 @@ def _export(request: ExportRequest) -> Export:
     ours = nearest(camera, Radial.blank((2, 3)))
     loss = camera_loss(name, camera, ours.project, field_box(request.calibration.targets))
     a2, a3 = ours.lens.values
-    alpha, beta, gamma = euler_from_rotation(ours.cam_from_world.rotation)
-    rows = {
-        "image_size": np.array(ours.image_size, dtype=float),
-        "a1": np.array(1.0),
-        "a2": np.array(a2),
-        "a3": np.array(a3),
-        "phi": np.array(ours.phi),
+    rows: dict[str, ArrayLike] = {
+        "image_size": ours.image_size,
+        "a1": 1.0,
+        "a2": a2,
+        "a3": a3,
+        "phi": ours.phi,
         "K": ours.matrix,
         "R": ours.cam_from_world.rotation,
         "t": ours.position,
-        "alpha_beta_gamma": np.array([alpha, beta, gamma]),
+        "alpha_beta_gamma": euler_from_rotation(ours.cam_from_world.rotation),
         "H": ours.homography(),
     }
     comments = [
@@ -43,7 +43,7 @@ def _export(request: ExportRequest) -> Export:
     return Export(text.encode(), (loss,), "a1, a2, a3, phi, K, R, t, angles and H")
 
 
-def _text(values: Array) -> str:
+def _text(values: ArrayLike) -> str:
     return "; ".join(" ".join(repr(float(v)) for v in row) for row in np.atleast_2d(values))
 
 

@@ -64,15 +64,9 @@ def prepare_export(
 ) -> Export:
     """Make an export without writing it; see `export`."""
     form, path = export_format(to), Path(path)
-    return form.export(
-        ExportRequest(
-            calibration,
-            _stations(calibration, form, stations),
-            _ending(form, path),
-            read_bytes(path) if form.edits and path.exists() else None,
-        ),
-        **_known_options(form, options),
-    )
+    names, ending = _stations(calibration, form, stations), _ending(form, path)
+    existing = read_bytes(path) if form.edits and path.exists() else None
+    return form.export(ExportRequest(calibration, names, ending, existing), **_known_options(form, options))
 
 
 def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> Calibration | Observations:
