@@ -189,21 +189,15 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
         "limit_deg": straight.limit_deg,
         "black_px": straight.warp.black,
     }
-    return (
-        lambda path: (straight.warp.apply(_read(path, camera, name)), {}, _straight_line(straight, args.whole)),
-        facts,
-        "the straight image's camera: its matrix K, no distortion" + ("" if station is None else ", its pose"),
-    )
-
-
-def _straight_line(straight: report.Straightening, whole: bool) -> str:
     (width, height), (across, down) = straight.camera.image_size, straight.view_deg
-    ends = whole and straight.limit_deg is not None
-    return (
+    line = (
         f"{width} x {height} px, phi {straight.camera.phi:.2f} px, {across:.1f} x {down:.1f} degrees, "
         f"{100.0 * straight.share:.1f} % of the photograph, {_black(straight.warp.size, straight.warp.black)}"
-        + (f"; nothing from {straight.limit_deg:.1f} degrees off the axis on" if ends else "")
     )
+    if args.whole and straight.limit_deg is not None:
+        line += f"; nothing from {straight.limit_deg:.1f} degrees off the axis on"
+    words = "the straight image's camera: its matrix K, no distortion" + ("" if station is None else ", its pose")
+    return lambda path: (straight.warp.apply(_read(path, camera, name)), {}, line), facts, words
 
 
 def _black(size: tuple[int, int], count: int) -> str:
