@@ -13,16 +13,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.scene import Arc, Curve, Segment, Target, custom, ssl_field
 from ceres_cal.scene.symmetry import samples
 
-_SIZES = {  # name in the message: name in the target
-    "field_length": "field_length_m",
-    "field_width": "field_width_m",
-    "goal_width": "goal_width_m",
-    "penalty_area_depth": "penalty_area_depth_m",
-    "penalty_area_width": "penalty_area_width_m",
-    "center_circle_radius": "center_circle_radius_m",
-    "line_thickness": "line_thickness_m",
-    "goal_center_to_penalty_mark": "goal_center_to_penalty_mark_m",
-}
+_LENGTHS = "field_length field_width goal_width penalty_area_depth penalty_area_width"
+_SIZES = (*_LENGTHS.split(), "center_circle_radius", "line_thickness", "goal_center_to_penalty_mark")
+"""Sizes by their names in the message; in the target they end in _m."""
 _A_LENGTH_MM = 10500  # limit between divisions B and A
 _RULES = {"goal_depth": 180, "goal_height": 155, "boundary_width": 300, "ball_radius": 21.5, "max_robot_radius": 90.0}
 _SHAPES = "CenterCircle TopTouchLine BottomTouchLine LeftGoalLine RightGoalLine HalfwayLine CenterLine"
@@ -46,7 +39,7 @@ def target_of(field: Mapping[str, Any]) -> Target:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"a line or an arc of the field has an invalid value: {error}") from None
     division = _division_of(field["field_length"])
-    given = {ours: 1e-3 * float(field[name]) for name, ours in _SIZES.items() if field.get(name)}
+    given = {f"{name}_m": 1e-3 * float(field[name]) for name in _SIZES if field.get(name)}
     by_rule, nominal = ssl_field(division), ssl_field(division, **given)
     if nominal.curves == by_rule.curves and nominal.points == by_rule.points:
         nominal = by_rule
@@ -109,7 +102,7 @@ def _sizes_of(target: Target) -> dict[str, int]:
     """Sizes of a field of the league; empty for another target."""
     if target.kind != "ssl-field":
         return {}
-    return {theirs: round(1e3 * target.dimensions[ours]) for theirs, ours in _SIZES.items()}
+    return {name: round(1e3 * target.dimensions[f"{name}_m"]) for name in _SIZES}
 
 
 def _division_of(length_mm: float) -> str:
