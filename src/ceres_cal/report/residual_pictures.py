@@ -372,15 +372,16 @@ def support(material: Material, name: str) -> Figure:
     table, size = material.diagnosis.table, material.calibration.cameras[name].image_size
     own = material.of_camera(name) & table.inlier
     counts, ends = counts_of_parts(table.pixel[own], size)
-    lines = []
+    lines, rows, whole, observed = [], [], 0, 0
     for curve, pixels in lines_in_image(material, name).items():
         known = curve in table.features
         of_curve = own & table.is_curve & (table.feature == (table.features.index(curve) if known else -1))
-        lines.append((curve, pixels, _near(pixels, table.pixel[of_curve], _NEAR * size[0]), int(of_curve.sum())))
-    seen = [np.isfinite(pixels[:, 0]) for _, pixels, _, _ in lines]
-    found = [near[visible] for (_, _, near, _), visible in zip(lines, seen, strict=True)]
-    shares = [float(np.mean(one)) if len(one) else np.nan for one in found]
-    whole, observed = sum(map(len, found)), sum(int(one.sum()) for one in found)
+        near = _near(pixels, table.pixel[of_curve], _NEAR * size[0])
+        visible = near[np.isfinite(pixels[:, 0])]
+        share = f"{100.0 * float(np.mean(visible)):.0f} %" if len(visible) else "not visible"
+        lines.append((pixels, near))
+        rows.append((curve, share, grouped(int(of_curve.sum()))))
+        whole, observed = whole + len(visible), observed + int(visible.sum())
 
     def draw(axes: Axes, width_in: float) -> None:
         from matplotlib.colors import ListedColormap
@@ -388,7 +389,7 @@ def support(material: Material, name: str) -> Figure:
         axes.pcolormesh(*ends, counts > 0, cmap=ListedColormap([_EMPTY, _FILLED]), vmin=0, vmax=1, edgecolor="white")
         canvas.dots(axes, table.pixel[own][:: stride(material, int(own.sum()))], POINT, 1.2, alpha=0.5)
         for color, kept, label in ((OUTLIER, False, "line not observed"), (CURVE, True, "line observed")):
-            parts = [np.where((near == kept)[:, None], pixels, np.nan) for _, pixels, near, _ in lines]
+            parts = [np.where((near == kept)[:, None], pixels, np.nan) for pixels, near in lines]
             if parts:
                 apart = [np.vstack([part, [[np.nan, np.nan]]]) for part in parts]
                 axes.plot(*np.concatenate(apart).T, color=color, linewidth=2.0, label=label)
@@ -399,10 +400,6 @@ def support(material: Material, name: str) -> Figure:
     filled = int(np.count_nonzero(counts))
     of_lines = f" {100.0 * observed / whole:.0f} % of the visible line length was observed (green)." if whole else ""
     shape = size[1] / size[0]
-    rows = [
-        (curve, "not visible" if np.isnan(share) else f"{100.0 * share:.0f} %", grouped(count))
-        for (curve, _, _, count), share in zip(lines, shares, strict=True)
-    ]
     rows.append(("parts of the image", f"{100.0 * filled / counts.size:.0f} %", grouped(int(own.sum()))))
     return Figure(
         f"support-{number_of(material, name)}",
