@@ -134,12 +134,9 @@ class Drag(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag=
         if self.what == "point":
             points = {**state.points, self.name: Click(self.x, self.y, self.sigma)}
             return msgspec.structs.replace(state, points=points)
-        places, here = list(state.places), Place(self.name, self.x, self.y, self.sigma)
-        if self.number is None or self.number >= len(places):
-            places.append(here)
-        else:
-            places[self.number] = here
-        return msgspec.structs.replace(state, places=tuple(places))
+        at = len(state.places) if self.number is None else self.number
+        here = Place(self.name, self.x, self.y, self.sigma)
+        return msgspec.structs.replace(state, places=(*state.places[:at], here, *state.places[at + 1 :]))
 
 
 class ButtonPress(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="now"):
