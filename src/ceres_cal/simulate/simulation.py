@@ -114,7 +114,7 @@ def _points_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
 
 
 def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
-    target = scene.targets[plan.target]
+    target, side = scene.targets[plan.target], SIDES[plan.side]
     chosen = _chosen(plan.curves, target.curve_names)
     places, positions, features, start = [np.empty((0, 3))], [np.empty(0)], [chosen[:0]], 0.0
     for i in chosen:
@@ -123,7 +123,7 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
         pieces = max(1, round(curve.length_m / plan.spacing_m))
         share = (np.arange(pieces) + 0.5) / pieces
         low, high = curve.parameter_range
-        places.append(along_curve(curve, low + share * (high - low), SIDES[plan.side]))
+        places.append(along_curve(curve, low + share * (high - low), side))
         positions.append(start + share * curve.length_m)
         features.append(np.full(pieces, i, dtype=np.int32))
         start += curve.length_m
@@ -131,7 +131,6 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
     rows, pixels = _project_seen(scene, plan, camera, there)
     neighbour = _neighbours(target, feature[rows], there[rows])
     position = np.concatenate(positions)[rows]
-    side = SIDES[plan.side]
     return _InView(feature[rows], pixels, len(chosen), camera.image_size, side, position, neighbour)
 
 
