@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 _AUTO = "auto"
 _CAMERA, _SOLVE = "the camera", "the solve"
+_camera, _solve = (partial(option, group=group) for group in (_CAMERA, _SOLVE))
+_camera_switch, _solve_switch = (partial(switch, group=group) for group in (_CAMERA, _SOLVE))
 
 
 def _lens_kind(name: str) -> str:
@@ -39,97 +42,80 @@ class CalibrateArguments(arguments.ReportArguments):
         "OBS", "files of observations (.json, .npz, or one folder .columns); several are taken together"
     )
     output: Path | None = arguments.output_option("the calibration", None)
-    lens: str | None = option(
+    lens: str | None = _camera(
         "lens model: radial (a polynomial of the radius), brown (OpenCV's), kannala-brandt (OpenCV's fisheye), spline "
         "(no formula), ...: `--lens ?` names all; default: auto, the simplest with a formula that predicts held-out "
         "views as well as any other",
         "KIND",
         read=_lens_kind,
-        group=_CAMERA,
     )
-    powers: str | None = option(
+    powers: str | None = _camera(
         "powers of the radius in the radial and spline lenses; default: chosen with --lens auto, else 2,3, to which "
         "spline adds more where the residuals require it",
         "2,3",
-        group=_CAMERA,
     )
-    terms: str = option(
+    terms: str = _camera(
         "further terms of the lens: rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, "
         "p2) of kannala-brandt, surface (displacements on a grid over the picture) of spline",
         "NAME,...",
         "",
-        group=_CAMERA,
     )
-    fix: tuple[str, ...] = option(
+    fix: tuple[str, ...] = _camera(
         "hold phi (the focal length in px), aspect (fy / fx), cx, cy (the principal point in px), skew or a "
         "coefficient of the lens at a value, such as k3=0",
         "NAME=VALUE",
         repeatable=True,
-        group=_CAMERA,
     )
-    free_aspect: bool | None = switch(
+    free_aspect: bool | None = _camera_switch(
         "let fy / fx be anything (default: near 1, or what the observations clearly say; `--fix aspect=1` holds it)",
         default=None,
-        group=_CAMERA,
     )
-    free_skew: bool = switch("solve for skew, by which columns of pixels are not perpendicular to rows", group=_CAMERA)
-    usual_camera: bool = switch(
+    free_skew: bool = _camera_switch("solve for skew, by which columns of pixels are not perpendicular to rows")
+    usual_camera: bool = _camera_switch(
         "do not assume that the camera is a usual one: any focal length, any principal point, any decentring of the "
         "lens; pixels are still taken to be square",
         default=True,
         flags=("--no-usual-camera",),
-        group=_CAMERA,
     )
-    free_principal_point: bool = switch(
-        "hold the principal point at the image's centre", default=True, flags=("--hold-principal-point",), group=_CAMERA
+    free_principal_point: bool = _camera_switch(
+        "hold the principal point at the image's centre", default=True, flags=("--hold-principal-point",)
     )
-    tolerance: tuple[str, ...] = option(
+    tolerance: tuple[str, ...] = _camera(
         "solve for a target as it was built, with a standard deviation in metres, or such as 10mm: field.lines_m=0.01, "
         "field.points_m=0.005 or board.warp_m=0.002",
         "SPEC",
         repeatable=True,
-        group=_CAMERA,
     )
-    as_drawn: bool = switch(
+    as_drawn: bool = _camera_switch(
         "take targets without a tolerance as drawn, and floors as flat and square. Default: corners, lines and bows of "
         "boards whose residuals repeat over the views are solved for, and one floor in five is assumed to be off by "
         "2 mm over 9 m",
-        group=_CAMERA,
     )
-    as_built: bool = switch("solve for targets as they were built: the default", group=_CAMERA)
+    as_built: bool = _camera_switch("solve for targets as they were built: the default")
     prior: tuple[str, ...] = arguments.prior_option(group=_CAMERA)
     estimate: tuple[str, ...] = arguments.estimate_option(group=_CAMERA)
-    mend_labels: bool = switch(
+    mend_labels: bool = _solve_switch(
         "where features were observed under the name of another feature, correct the names and calibrate again; "
         "default: say which they are",
-        group=_SOLVE,
     )
-    loss: arguments.Loss = option("robust loss", default="huber", group=_SOLVE)
-    loss_scale: float = option(
-        "residual, in standard deviations, from which an observation counts less", "SIGMA", 2.5, group=_SOLVE
+    loss: arguments.Loss = _solve("robust loss", default="huber")
+    loss_scale: float = _solve("residual, in standard deviations, from which an observation counts less", "SIGMA", 2.5)
+    reject_sigma: float = _solve(
+        "observations that are more standard deviations off are taken out and listed", "SIGMA", 5.0
     )
-    reject_sigma: float = option(
-        "observations that are more standard deviations off are taken out and listed", "SIGMA", 5.0, group=_SOLVE
-    )
-    noise_scale: Literal["estimate", "stated"] = option(
+    noise_scale: Literal["estimate", "stated"] = _solve(
         "estimate the noise of points and of curves from their residuals (default), or keep the stated sigmas",
         default="estimate",
-        group=_SOLVE,
     )
-    closed_form_only: bool = switch(
-        "stop at the closed forms of R. Rojas's paper: a baseline to compare with, not a calibration", group=_SOLVE
+    closed_form_only: bool = _solve_switch(
+        "stop at the closed forms of R. Rojas's paper: a baseline to compare with, not a calibration"
     )
-    max_iterations: int = option("most iterations of each solve", "N", 100, read=whole(1), group=_SOLVE)
-    threads: int = option(
-        "most threads; default: 0, where the solver chooses",
-        "N",
-        0,
-        read=whole(0),
-        group=_SOLVE,
-        elsewhere=("jobs",),
+    max_iterations: int = _solve("most iterations of each solve", "N", 100, read=whole(1))
+    threads: int = _solve(
+        "most threads; default: 0, where the solver chooses", "N", 0, read=whole(0), elsewhere=("jobs",)
     )
-    scheduler: str | None = option(
-        "a Dask scheduler, whose workers keep the observations, such as tcp://host:8786", "ADDRESS", group=_SOLVE
+    scheduler: str | None = _solve(
+        "a Dask scheduler, whose workers keep the observations, such as tcp://host:8786", "ADDRESS"
     )
 
 

@@ -150,6 +150,11 @@ def median_text(data: dict[str, Any]) -> str:
 # ---- boards and rings -----------------------------------------------------------------------------------------------
 
 
+def _side(what: str, *beside: str) -> Any:
+    """An option for a length in metres, which needs others."""
+    return option(what, "M", read=length("m"), beside=beside)
+
+
 class BoardArguments(QuietArguments, DetectArguments):
     """Photographs, and the board in them."""
 
@@ -163,29 +168,20 @@ class BoardArguments(QuietArguments, DetectArguments):
         "TARGET",
         elsewhere=("board",),
     )
-    square: float | None = option("side of a square in metres, or such as 25mm", "M", read=length("m"))
-    april_grid: float | None = option(
-        "Kalibr's AprilGrid: side of a tag likewise; columns and rows are of tags",
-        "M",
-        read=length("m"),
-        beside=("gap",),
-    )
+    square: float | None = _side("side of a square in metres, or such as 25mm")
+    april_grid: float | None = _side("Kalibr's AprilGrid: side of a tag likewise; columns and rows are of tags", "gap")
     gap: float | None = option(
         "with --april-grid: gap between tags divided by their side (tagSpacing)",
         "SHARE",
         beside=("april_grid",),
     )
-    circles: float | None = option(
-        "a grid of circles at this distance, instead of squares", "M", read=length("m"), beside=("diameter",)
-    )
+    circles: float | None = _side("a grid of circles at this distance, instead of squares", "diameter")
     asymmetric: bool = switch("with --circles: every other row half a step off, M as in OpenCV", beside=("circles",))
-    diameter: float | None = option("with --circles: of a circle", "M", read=length("m"), beside=("circles",))
+    diameter: float | None = _side("with --circles: of a circle", "circles")
     charuco: str | None = option(
         "the board has markers of this OpenCV dictionary, such as DICT_4X4_50", "DICT", beside=("marker",)
     )
-    marker: float | None = option(
-        "side of a marker likewise, with --charuco", "M", read=length("m"), beside=("charuco",)
-    )
+    marker: float | None = _side("side of a marker likewise, with --charuco", "charuco")
     legacy: bool = switch("with --charuco: made with OpenCV before 4.6", beside=("charuco",))
     corner_fit: Literal["saddle", "opencv"] = option(
         "measure corners by a saddle fit (default), also of boards partly outside the picture, or as OpenCV does, "

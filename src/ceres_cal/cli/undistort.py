@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,9 +19,10 @@ if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
     from ceres_cal.calibration import Calibration
 
-_STRAIGHT = "straight images (default)"
-_TOP = "the field from above"
-_OVERLAY = "the model in the photograph"
+_STRAIGHT, _TOP, _OVERLAY = "straight images (default)", "the field from above", "the model in the photograph"
+_straight_option = partial(option, group=_STRAIGHT)
+_top_option = partial(option, group=_TOP, beside=("top_view",))
+_overlay_option = partial(option, group=_OVERLAY, beside=("overlay",))
 Area = tuple[float, float, float, float]
 """x0, y0, x1 and y1, m."""
 
@@ -50,36 +52,23 @@ class UndistortArguments(QuietArguments):
     format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png", elsewhere=("to",))
     crop: bool = switch("the largest rectangle without black (default)", group=_STRAIGHT, alone="shape")
     whole: bool = switch("everything that the photograph shows, black around it", group=_STRAIGHT, alone="shape")
-    size: tuple[int, int] | None = option(
-        "size of the straight image, px; default: the photograph's", "WxH", read=_size, group=_STRAIGHT, alone="scale"
+    size: tuple[int, int] | None = _straight_option(
+        "size of the straight image, px; default: the photograph's", "WxH", read=_size, alone="scale"
     )
-    phi: float | None = option(
+    phi: float | None = _straight_option(
         "focal length of the straight image in px, instead of its size; the camera's own keeps the scale",
         "PX",
-        group=_STRAIGHT,
         alone="scale",
     )
-    angle: float | None = option(
-        "widest angle of view; default: 150 with --whole, else as far as detail goes",
-        "DEG",
-        group=_STRAIGHT,
+    angle: float | None = _straight_option(
+        "widest angle of view; default: 150 with --whole, else as far as detail goes", "DEG"
     )
     top_view: bool = switch("the field from straight above, to scale", group=_TOP)
-    mm_per_px: float | None = option(
-        "scale of the top view; default: 5", "MM", read=arguments.length("mm"), group=_TOP, beside=("top_view",)
-    )
-    area: Area | None = option(
-        "area in metres; default: the field and 0.3 m around it",
-        "X0,Y0,X1,Y1",
-        read=_area,
-        group=_TOP,
-        beside=("top_view",),
-    )
+    mm_per_px: float | None = _top_option("scale of the top view; default: 5", "MM", read=arguments.length("mm"))
+    area: Area | None = _top_option("area in metres; default: the field and 0.3 m around it", "X0,Y0,X1,Y1", read=_area)
     overlay: bool = switch("draw the calibrated lines and boards into photographs", group=_OVERLAY)
-    before: Path | None = option("draw an earlier calibration too", "CALIBRATION", group=_OVERLAY, beside=("overlay",))
-    observations: Path | None = option(
-        "say what each frame shows, and draw them too", "OBS", group=_OVERLAY, beside=("overlay",)
-    )
+    before: Path | None = _overlay_option("draw an earlier calibration too", "CALIBRATION")
+    observations: Path | None = _overlay_option("say what each frame shows, and draw them too", "OBS")
     height_mm: float | None = arguments.height_option(
         "plane of the top view, or of a second drawing in an overlay", beside=("top_view", "overlay")
     )
