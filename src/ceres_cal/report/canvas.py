@@ -31,6 +31,14 @@ _THEMED = {
 
 NARROW_IN, WIDE_IN = 3.65, 7.5
 """Widths of a picture in one column, which is what a phone shows, and of one across both, inches."""
+_TICKS = {
+    "color": PAINT,
+    "labelcolor": QUIET,
+    "labelsize": 7.0,
+    "major.size": 2.5,
+    "major.width": 0.7,
+    "minor.size": 0.0,
+}
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",  # text remains text, in the page's font, and can be searched and read aloud
     "text.parse_math": False,  # names come from files
@@ -49,18 +57,7 @@ _STYLE: dict[str, Any] = {
     "grid.color": FAINT,
     "grid.linewidth": 0.7,
     "text.color": INK,
-    "xtick.color": PAINT,
-    "ytick.color": PAINT,
-    "xtick.labelcolor": QUIET,
-    "ytick.labelcolor": QUIET,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "xtick.minor.size": 0.0,
-    "ytick.minor.size": 0.0,
+    **{f"{axis}tick.{name}": value for axis in "xy" for name, value in _TICKS.items()},
     "legend.frameon": False,
     "legend.fontsize": 7.0,
     "legend.handlelength": 1.4,

@@ -153,23 +153,19 @@ def _held_out(choices: Mapping[str, LensChoice], options: Options) -> Section:
 # ---- tables ---------------------------------------------------------------------------------------------------------
 
 
+_COLUMNS = ("points", "points_rms_px", "curves", "curves_rms_px", "rms_mm", "rms_sigma", "rejected")
+_PLACES = (0, 3, 0, 3, 2, 3, 0)
+"""Columns of a table of groups, and their decimals; counts have none."""
+
+
 def summary_table(head: str, summary: Summary, rows: Sequence[int], names: Sequence[str] = ()) -> Table:
     """Table of some groups of observations, given by number; `names` replaces the summary's own names."""
-    of_points, of_curves = summary.points_rms_px, summary.curves_rms_px
-    cells = tuple(
-        (
-            name,
-            grouped(int(summary.points[i])),
-            fixed(float(of_points[i]), 3),
-            grouped(int(summary.curves[i])),
-            fixed(float(of_curves[i]), 3),
-            fixed(float(summary.rms_mm[i]), 2),
-            fixed(float(summary.rms_sigma[i]), 3),
-            grouped(int(summary.rejected[i])),
-        )
-        for i, name in zip(rows, names or [summary.names[i] for i in rows], strict=True)
+    columns = (
+        [fixed(value, places) if places else grouped(value) for value in getattr(summary, name)[list(rows)].tolist()]
+        for name, places in zip(_COLUMNS, _PLACES, strict=True)
     )
-    return Table((head, "points", "rms px", "curves", "rms px", "mm", "sigma", "out"), cells)
+    cells = zip(names or [summary.names[i] for i in rows], *columns, strict=True)
+    return Table((head, "points", "rms px", "curves", "rms px", "mm", "sigma", "out"), tuple(cells))
 
 
 def _summary(summary: Summary, *, by_size: bool) -> list[str]:
