@@ -62,9 +62,10 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
     return [f"cv2.undistortPoints stops after five rounds, here up to {two_digits(worst)} px off: call it with {end}"]
 
 
-def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:
-    """Return K, coefficients (1, N) and the pose (1, 6): rvec, tvec."""
-    return camera.matrix, np.array([camera.coefficients]), camera.pose.log()[None]
+def _entries(camera: ForeignCamera, *names: str) -> dict[str, Any]:
+    """Return K, coefficients (1, N) and the pose (1, 6), rvec and tvec, under these names."""
+    numbers = camera.matrix, np.array([camera.coefficients]), camera.pose.log()[None]
+    return dict(zip(names, numbers, strict=True))
 
 
 def _common(camera: ForeignCamera) -> dict[str, Any]:
@@ -73,8 +74,7 @@ def _common(camera: ForeignCamera) -> dict[str, Any]:
 
 
 def _mono(camera: ForeignCamera, lost: list[str]) -> dict[str, Any]:
-    matrix, coefficients, pose = _numbers(camera)
-    named = {"camera_matrix": matrix, "distortion_coefficients": coefficients, "extrinsic_parameters": pose}
+    named = _entries(camera, "camera_matrix", "distortion_coefficients", "extrinsic_parameters")
     return _common(camera) | named | {"loss": "; ".join(lost)}
 
 
@@ -87,8 +87,7 @@ def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
         raise InputError("OpenCV's stereo files hold two cameras of one image size and one kind of lens")
     entries = _common(first)
     for number, camera in enumerate(cameras, start=1):
-        matrix, coefficients, pose = _numbers(camera)
-        entries |= {f"M{number}": matrix, f"D{number}": coefficients, f"extrinsic_parameters{number}": pose}
+        entries |= _entries(camera, f"M{number}", f"D{number}", f"extrinsic_parameters{number}")
     between = second.pose @ first.pose.inverse
     turn, shift = between.rotation, between.translation[:, None]
     given = (entries["M1"], entries["D1"].T, entries["M2"], entries["D2"].T, first.image_size, turn, shift)
