@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, replace
+from ceres_cal.base import Array, Frozen
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,17 +83,15 @@ class Hover(Frozen, eq=True):
     y: tuple[float, float, int]
     values: tuple[str, ...]
     text: str
-    names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    names: tuple[tuple[str, ...], ...] = ((), ())
 
     @classmethod
-    def of(cls, x: Array, y: Array, values: Iterable[str], text: str) -> Hover:
-        """Make the text for values over a grid x (X,), y (Y,) with even steps, row by row."""
+    def of(cls, x: Array, y: Array, values: Iterable[str], text: str, *names: Sequence[str]) -> Hover:
+        """Make the text for values over a grid x (X,), y (Y,) with even steps, row by row; `names` of columns and rows
+        replace their numbers.
+        """
         across, down = ((float(axis[0]), float(axis[-1]), len(axis)) for axis in (x, y))
-        return cls(across, down, tuple(values), text)
-
-    def named(self, columns: Sequence[str], rows: Sequence[str] = ("",)) -> Hover:
-        """Return it with names of the columns and rows in place of numbers."""
-        return replace(self, names=(tuple(columns), tuple(rows)))
+        return cls(across, down, tuple(values), text, tuple(map(tuple, names)) or ((), ()))
 
 
 def to_svg(draw: Draw, height: float, width_in: float, name: str, *, whole_file: bool = False) -> str:

@@ -297,7 +297,7 @@ def by_frame(material: Material) -> Figure:
         "has wrong labels, motion blur or a moved camera. A lasting step means that the camera moved at that frame.",
         draw,
         summary_table("frame", frames, range(len(frames.names))),
-        hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
+        hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma", frames.names, [""]),
     )
 
 

@@ -39,7 +39,8 @@ def correlation(material: Material) -> Figure | None:
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = posterior.covariance[np.ix_(chosen, chosen)] / sd[:, None] / sd
     labels = [label(key, keys) for key in keys]
-    rest = len(posterior.keys) - len(keys)
+    rest, places = len(posterior.keys) - len(keys), np.arange(0.5, len(labels))
+    shown = (f"{value:+.3f}" if np.isfinite(value) else "unknown" for value in matrix.ravel().tolist())
     return Figure(
         "correlation",
         "Correlation of the numbers",
@@ -49,12 +50,7 @@ def correlation(material: Material) -> Figure | None:
         lambda axes, _: _draw_matrix(axes, matrix, labels),
         _pairs(matrix, labels),
         0.86,
-        hover=Hover.of(
-            places := np.arange(0.5, len(labels)),
-            places,
-            [f"{value:+.3f}" if np.isfinite(value) else "unknown" for value in matrix.ravel().tolist()],
-            "{x}, {y}: {value}",
-        ).named(labels, labels),
+        hover=Hover.of(places, places, shown, "{x}, {y}: {value}", labels, labels),
     )
 
 
