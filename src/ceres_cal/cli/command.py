@@ -145,8 +145,8 @@ def _require_beside(args: Arguments) -> None:
 
 def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return names and settings of an argparse argument."""
-    about, item = one.metadata, _item(kind)
-    how: dict[str, Any] = {"help": _help(one), "metavar": about["metavar"]}
+    about, item, needed = one.metadata, _item(kind), one.default is MISSING
+    how: dict[str, Any] = {"help": _help(one), "metavar": about["metavar"], "default": None if needed else one.default}
     if get_origin(item) is Literal:
         how |= {"choices": get_args(item), "metavar": None}
     else:
@@ -154,19 +154,17 @@ def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, An
         how["type"] = about.get("read") or (_file if is_file else _READ.get(item, item))
     if "flags" not in about:
         if get_origin(kind) is tuple:
-            how["nargs"] = "+" if one.default is MISSING else "*"
-        elif one.default is not MISSING:
+            how["nargs"] = "+" if needed else "*"
+        elif not needed:
             how["nargs"] = "?"
-        return (one.name,), how if one.default is MISSING else {**how, "default": one.default}
+        return (one.name,), how
     names = about["flags"] or (flag(one.name),)
-    how |= {"dest": one.name, "default": one.default}
     if item is bool:
         action = f"store_{not one.default}".lower()
         return names, {"action": action, "help": how["help"], "dest": one.name, "default": one.default}
-    if one.default is MISSING:
-        how |= {"required": True, "default": None}
+    how |= {"dest": one.name, "required": needed}
     if about["repeatable"]:
-        return names, {**how, "action": "append", "default": None if one.default is MISSING else list(one.default)}
+        return names, {**how, "action": "append", "default": None if needed else list(how["default"])}
     return names, {**how, "action": _Once}
 
 

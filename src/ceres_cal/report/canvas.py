@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen
+from ceres_cal.base import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,28 +70,16 @@ Draw = Callable[["Axes", float], None]
 """Draws into one pair of axes, for a picture of a width in inches."""
 
 
-class Hover(Frozen, eq=True):
-    """Text beside the pointer, for the nearest of evenly spaced places over the axes.
+def hover(x: Array, y: Array, values: Iterable[str], text: str, *names: Sequence[str]) -> dict[str, Any]:
+    """Text beside the pointer, for the nearest of evenly spaced places over the axes, as the page's script reads it.
 
-    Attributes:
-        x, y: first and last place in units of the axes, and number of places.
+    Args:
+        x (X,), y (Y,): the places, in units of the axes.
         values: text of the value at each place, row by row; "" where nothing is shown.
         text: template with {x}, {y} and {value}. names: of columns and of rows, shown instead of their numbers.
     """
-
-    x: tuple[float, float, int]
-    y: tuple[float, float, int]
-    values: tuple[str, ...]
-    text: str
-    names: tuple[tuple[str, ...], ...] = ((), ())
-
-    @classmethod
-    def of(cls, x: Array, y: Array, values: Iterable[str], text: str, *names: Sequence[str]) -> Hover:
-        """Make the text for values over a grid x (X,), y (Y,) with even steps, row by row; `names` of columns and rows
-        replace their numbers.
-        """
-        across, down = ((float(axis[0]), float(axis[-1]), len(axis)) for axis in (x, y))
-        return cls(across, down, tuple(values), text, tuple(map(tuple, names)) or ((), ()))
+    across, down = ((float(axis[0]), float(axis[-1]), len(axis)) for axis in (x, y))
+    return {"x": across, "y": down, "values": tuple(values), "text": text, "names": names or ((), ())}
 
 
 def to_svg(draw: Draw, height: float, width_in: float, name: str, *, whole_file: bool = False) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.frozen import Frozen, field
 
 if TYPE_CHECKING:
-    from ceres_cal.report.canvas import Draw, Hover
+    from ceres_cal.report.canvas import Draw
 
 WIDTH = 100
 """Width of a text for users, in letters."""
@@ -75,7 +75,7 @@ class Figure(Frozen, eq=True):
     columns.
 
     With a `wide_height` it is drawn twice, for a wide and for a narrow window; heights are over the width. `hover` is
-    the text beside the pointer; without a pointer the table has the same values.
+    the text beside the pointer (`canvas.hover`); without a pointer the table has the same values.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Figure(Frozen, eq=True):
     table: Table | None = None
     height: float = 0.66
     wide_height: float | None = None
-    hover: Hover | None = None
+    hover: Mapping[str, Any] | None = None
 
 
 class Gallery(Frozen, eq=True):

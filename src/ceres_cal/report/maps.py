@@ -11,7 +11,7 @@ from ceres_cal.base import Array, at_height, evenly, grid_places, largest, mm, s
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, ImageMap, image_grid
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Draw, Hover
+from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Draw
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.quality import Material, image_border, paint_of
 from ceres_cal.report.residual_pictures import counts_of_parts, number_of, owner_suffix
@@ -142,7 +142,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         draw,
         grid_table(f"{LABEL}, at y \\ x", one.radius_95_mm[::-1], one.x_m, one.y_m[::-1], "{:.1f} m"),
         height,
-        hover=Hover.of(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
+        hover=canvas.hover(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
     )
 
 
@@ -220,7 +220,7 @@ def _over_image(
         draw,
         grid_table(f"95 % within, {unit}, at y \\ x", radii, *grid, "{:.0f} px"),
         0.92 * height / width + 0.2,
-        hover=Hover.of(*grid, spoken(radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
+        hover=canvas.hover(*grid, spoken(radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
     )
 
 

@@ -73,7 +73,7 @@ def _drawn(piece: document.Figure) -> str:
         return f'<img alt="{escape(piece.title)}" src="data:image/jpeg;base64,{content}">'
     label = f'role="img" aria-label="{escape(piece.title)}"'
     if piece.hover is not None:
-        label += f' data-hover="{escape(json.dumps(vars(piece.hover), separators=(",", ":"), ensure_ascii=False))}"'
+        label += f' data-hover="{escape(json.dumps(piece.hover, separators=(",", ":"), ensure_ascii=False))}"'
     narrow = to_svg(piece.draw, piece.height, NARROW_IN, f"{piece.name}-narrow")
     if piece.wide_height is not None:
         wide = to_svg(piece.draw, piece.wide_height, WIDE_IN, f"{piece.name}-wide")

@@ -15,7 +15,7 @@ from ceres_cal.base import Array, Indices, InputError, Mask, fixed, grouped, no_
 from ceres_cal.diagnostics import Diagnosis, ResidualTable
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summary
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Hover
+from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.findings import summary_table
 from ceres_cal.report.quality import Material, paint_of
@@ -297,7 +297,7 @@ def by_frame(material: Material) -> Figure:
         "has wrong labels, motion blur or a moved camera. A lasting step means that the camera moved at that frame.",
         draw,
         summary_table("frame", frames, range(len(frames.names))),
-        hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma", frames.names, [""]),
+        hover=canvas.hover(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma", frames.names, [""]),
     )
 
 

@@ -11,7 +11,7 @@ from ceres_cal.base import Array, counted, fixed, powered, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.problem.information import Key
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Hover
+from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.quality import Material
 from ceres_cal.report.residual_pictures import number_of, owner_suffix
@@ -50,7 +50,7 @@ def correlation(material: Material) -> Figure | None:
         lambda axes, _: _draw_matrix(axes, matrix, labels),
         _pairs(matrix, labels),
         0.86,
-        hover=Hover.of(places, places, shown, "{x}, {y}: {value}", labels, labels),
+        hover=canvas.hover(places, places, shown, "{x}, {y}: {value}", labels, labels),
     )
 
 
