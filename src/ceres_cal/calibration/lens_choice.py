@@ -47,7 +47,7 @@ from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
 from ceres_cal.posterior.posterior import LEAST_PROBABILITY, Posterior
-from ceres_cal.problem import Estimate, Options, moved
+from ceres_cal.problem import Estimate, Information, Options, moved
 from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Construction
 from ceres_cal.start.initialise import Start
@@ -187,9 +187,14 @@ class Comparison(Frozen):
             if isinstance(end, CalibrationError):
                 left -= weight
                 continue
-            ends = self._ends(seen, one, end, is_open, median(posterior.factors))
+            widened = median(posterior.factors)
+            ends = self._ends(seen, one, end, is_open, widened)
             weights = (weight / len(ends),) * len(ends)
-            found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
+            assert one.of.normals is not None  # it predicts
+            every = one.of.normals.information(one.of.to_nothing(one.form), posterior.stated)
+            known = (Information(every.keys, every.matrix / widened**2),) * len(ends)
+            found = replace(found, others=(*found.others, *ends), known=(*found.known, *known))
+            found = replace(found, weights=(*found.weights, *weights))
         # More observations than took part leave smaller differences by chance, so the weights are reduced by their
         # share.
         share = max(self.share, least_share) / max(left, LEAST_PROBABILITY)

@@ -16,7 +16,8 @@ from ceres_cal.calibration.lens_forms import PAPER, Form, undecentred
 from ceres_cal.calibration.lens_seen import found, profiles_of, seen_through
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.other_lenses import OtherLenses
-from ceres_cal.problem import Estimate, Options, Solution, problem_of, solve
+from ceres_cal.problem import Estimate, Information, Options, Solution, problem_of, solve
+from ceres_cal.problem.reduced import information
 
 # Natural logarithm of how much likelier another kind must be than the paper's: strong evidence (Kass and Raftery,
 # Journal of the American Statistical Association 90, 1995).
@@ -43,15 +44,24 @@ def others_of_few(observations: Observations, label: str, options: Options, near
     """
     (camera,) = observations.cameras
     options = replace(options.of_camera(camera), priors=observations.about_shown(options.priors))
-    each = {form.label: end for form, end in _with_each_kind(observations, options, near).items()}
+    solved = _with_each_kind(observations, options, near)
+    each = {form.label: end for form, end in solved.items()}
     own = each.pop(label, None)
     if own is None:
         return OtherLenses(near, (), (), {})
     costs = np.array([own.cost, *(end.cost for end in each.values())])
     likely = np.exp(costs.min() - costs)
     weights = tuple((likely / likely.sum())[1:].tolist())
-    reach_px = {name: one.reach_px for name, one in profiles_of(near, gather_sights(observations)).items()}
-    return OtherLenses(own.estimate, tuple(end.estimate for end in each.values()), weights, reach_px)
+    sights = gather_sights(observations)
+    reach_px = {name: one.reach_px for name, one in profiles_of(near, sights).items()}
+
+    def known(form: Form, there: Estimate) -> Information:
+        every = information(problem_of(sights, form.of(options), there), there).shared
+        return every.marginal([key for key in every.keys if key.kind in ("camera", "station")])
+
+    others = {form: end.estimate for form, end in solved.items() if form.label != label}
+    every = tuple(known(form, there) for form, there in others.items())
+    return OtherLenses(own.estimate, tuple(others.values()), weights, reach_px, known=every)
 
 
 def _with_each_kind(observations: Observations, options: Options, near: Estimate) -> dict[Form, Solution]:

@@ -27,7 +27,7 @@ from ceres_cal.base import Array, Frozen, Indices, cached_property, eigh, known_
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, inverse_roots, prior_equations
 from ceres_cal.observations.sights import Owner, SightKey, Sights
-from ceres_cal.problem import Estimate, Key, Problem, free_keys
+from ceres_cal.problem import Estimate, Information, Key, Problem, free_keys
 from ceres_cal.problem.reduced import normals_with_residuals, owned_columns, steps_of
 
 _RIDGE = 1e-3  # share added to the total information: a group that alone determines a direction cannot be left out
@@ -111,6 +111,13 @@ class GroupNormals(Frozen):
         foreseen = squares + np.sum(gradient * without, axis=(2, 3))
         squares += np.sum((2.0 * gradient + own @ without) * without, axis=(2, 3))
         return squares, foreseen, -np.linalg.slogdet(rest)[1], steps
+
+    def information(self, held: Collection[Key], stated: Information) -> Information:
+        """Return what is known of a camera and its stations if some numbers are held, with further information."""
+        every = (Information(self.keys, self._whole) + stated.marginal(stated.among(self.keys))).given(
+            [key for key in self.keys if key not in held]
+        )
+        return every.marginal([key for key in every.keys if key.kind in ("camera", "station")])
 
     def root(self, held: Collection[Key], stated: Array | float = 0.0) -> Array:
         """(K, K) a root of the covariance of the numbers, if some are held.

@@ -15,6 +15,8 @@ from ceres_cal.calibration.calibration import loosened, still_known
 from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.agreement import matched, require_posterior
 from ceres_cal.observations import Observations, Prior, Sights, gather_sights
+from ceres_cal.posterior import OtherLenses
+from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import GaussianPrior, Problem, gather_priors, require_possible_numbers
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
@@ -90,6 +92,9 @@ class RefitPlan(Frozen):
         stays: stations of the old calibration that have not moved, with its posterior as a prior.
         known: the old cameras, structure and stations that stay; stations that moved have no particular pose.
         prior: prior knowledge before `what` is taken into account. scales: earlier noise scales of points and curves.
+        before: the old calibration with the lens that was chosen then; None where that is `calibration` itself.
+        lens: number of the lens in the old posterior; 0 is the one that was chosen then. others: the other lenses by
+            which the old calibration predicted as well, as the new observations see them. near: where solves start.
     """
 
     calibration: Calibration
@@ -104,11 +109,37 @@ class RefitPlan(Frozen):
     known: Estimate
     prior: GaussianPrior
     scales: tuple[float, float]
+    before: Calibration | None = None
+    lens: int = 0
+    others: OtherLenses | None = None
+    near: Estimate | None = None
 
     @property
     def moved_cameras(self) -> frozenset[str]:
         """Cameras with a station that moved."""
         return frozenset(self.stations[name] for name in self.moved)
+
+    def of_lens(self, number: int) -> RefitPlan:
+        """Return the plan with another lens of the old posterior for the cameras that moved."""
+        calibration = of_other_lens(self.calibration, number, self.moved_cameras)
+        here, stations = calibration.estimate, self.known.stations
+        stays = {name: here.stations[name] for name in stations if name in self.stays}
+        known = replace(self.known, cameras=calibration.cameras, stations={**stations, **stays})
+        kept = [key for key in calibration.uncertainty.posterior.keys if _is_kept(key, self.stays)]
+        return replace(
+            self,
+            calibration=calibration,
+            options=replace(calibration.options, priors=self.options.priors),
+            known=known,
+            prior=calibration.prior_of(kept),
+            before=self.calibration,
+            lens=number,
+        )
+
+    @property
+    def is_repeated(self) -> bool:
+        """Whether the old calibration is a refit to these observations: it includes them already."""
+        return self.calibration.refitted is not None and self.calibration.digest == self.sights.observations.digest
 
     def loosened(self, what: str) -> frozenset[Key]:
         """Return the intrinsics about which nothing counts as known any more."""
@@ -216,6 +247,33 @@ def carried_prior(
         return before.without([key for key in before.keys if not _is_kept(key, stays)])
     kept = [key for key in calibration.uncertainty.posterior.keys if _is_kept(key, stays)]
     return calibration.prior_of(kept, of_lens=of_lens)
+
+
+def of_other_lens(calibration: Calibration, number: int, cameras: Collection[str]) -> Calibration:
+    """Return the calibration with another lens of its posterior for some cameras; where nothing is known of that lens's
+    numbers, they count as exact.
+    """
+    posterior, estimate = calibration.uncertainty.posterior, calibration.estimate
+    seen, known = posterior.lenses[number], Information.nothing()
+    if number and posterior.lens_information:
+        known = posterior.lens_information[number - 1]
+    stations = {name: one for name, one in seen.stations.items() if one.camera in cameras}
+    there = replace(
+        estimate,
+        cameras={**estimate.cameras, **{name: seen.cameras[name] for name in cameras}},
+        stations={**estimate.stations, **stations},
+    )
+    owners = {*(("camera", name) for name in cameras), *(("station", name) for name in stations)}
+    own = known.marginal([key for key in known.keys if key[:2] in owners])
+    rest = [key for key in posterior.keys if key[:2] not in owners and key.kind != "placement"]
+    information = own + posterior.normal_of_lens.marginal(rest)
+    asked = {name: calibration.options.of_camera(name) for name in there.cameras}
+    for name in cameras:
+        lens, free = there.cameras[name].lens, {key.quantity for key in own.keys}
+        names = tuple(one for one in lens.names if one in free)
+        asked[name] = replace(asked[name], lens=lens.kind, powers=lens.powers, coefficients=names, terms=lens.terms)
+    options = calibration.options.with_lenses(asked)
+    return replace(calibration, estimate=there, options=options, posterior=Posterior(information))
 
 
 def _is_kept(key: Key, stays: frozenset[str]) -> bool:

@@ -41,11 +41,11 @@ from ceres_cal.moves.poses import (
     movement,
     pose_candidates,
 )
+from ceres_cal.moves.refit_lenses import with_lens_of, with_lenses
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, make_plan, refit_problem
-from ceres_cal.observations import Observations, Sights, gather_sights
-from ceres_cal.posterior import OtherLenses, with_other_lenses
-from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting, difference
-from ceres_cal.robust.other_minima import solved_soon
+from ceres_cal.observations import Observations, Sights
+from ceres_cal.posterior import with_other_lenses
+from ceres_cal.problem import Estimate, SolveProgress, Station, difference
 from ceres_cal.start import Start, chained_poses
 
 # Equations with which a pose is unique: six numbers, and two that contradict a wrong one. Nothing changes at half of
@@ -86,16 +86,24 @@ def refit(
         DegenerateError: the observations do not determine a pose, or not uniquely after so large a move.
         SolutionError: no explanation fits, or one does that `what` does not allow; the message says which.
     """
-    plan = make_plan(calibration, observations, what, moved, options)
+    asked = make_plan(calibration, observations, what, moved, options)
+    plan = with_lenses(asked, _start)
 
     def changed(what: str) -> RefitPlan:
-        return make_plan(calibration, observations, what, moved, options)
+        return with_lenses(make_plan(calibration, observations, what, moved, options), _start, plan.lens)
 
     # reads: "no explanation fits ...", or that something else has changed, where more noise is less likely
     found = attempt(partial(_refitted_as_changed, plan, observations, progress, changed), SolutionError)
     if (least := _least_nats(plan, found)) is not None and (likeliest := _likeliest(plan)) is not plan:
         # quiet: nothing fits at more noise, either, and the answer is what was found before
-        noisier = attempt(partial(_refitted, likeliest, observations, progress))
+        noisier = attempt(
+            partial(
+                _refitted,
+                with_lenses(replace(asked, scales=likeliest.scales), _start, plan.lens),
+                observations,
+                progress,
+            )
+        )
         if isinstance(noisier, Calibration) and _nats(plan, plan.what, noisier) < least:
             times = f"{_noise(plan, noisier):.1f} times as noisy as those of the calibration before"
             return replace(noisier, remarks=(*noisier.remarks, f"the new observations are {times}"))
@@ -164,7 +172,7 @@ def _refitted(
     plan: RefitPlan, observations: Observations, progress: SolveProgress | None, change: OtherChangeError | None = None
 ) -> Calibration:
     calibration, what = plan.calibration, plan.what
-    estimate = _start(plan)
+    estimate = plan.near or _start(plan)
     zoomed = plan.moved_cameras if what in ("zoom", "everything") else ()
     phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
 
@@ -278,49 +286,17 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 
 def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
-    """Widen the posterior by lenses that predicted as well before, with the poses from which they see the new
-    observations: one picture determines a lens's numbers, but not which lens it is. After another zoom each distorts
-    rays at the same angle as before; after another iris the other lenses are unknown.
+    """Widen the posterior by lenses that predicted as well before, as they see the new observations: one picture
+    determines a lens's numbers, but not which lens it is.
     """
-    known = plan.calibration.uncertainty.posterior
-    if result.posterior is None or len(known.lenses) < 2 or plan.what in ("iris", "everything"):
+    if result.posterior is None or plan.others is None:
         return result
-    ratios = {name: camera.phi / plan.calibration.cameras[name].phi for name, camera in result.cameras.items()}
-    ratios = {name: ratio if plan.what == "zoom" else 1.0 for name, ratio in ratios.items()}
-    sights = gather_sights(plan.sights.observations.part(*result.inlier_masks(plan.sights.observations)))
-    problem, layout = refit_problem(plan, "pose-only", result.estimate)
-    _, *said = problem.priors
-    followed = result.posterior.followed  # cameras with a valley of phi
-    unfollowed = plan.moved_cameras - set(followed)
-    free = {name: own[own == 0] if name in unfollowed else own[:0] for name, own in layout.free.items()}
-    layout, weighting = replace(layout, stations=plan.moved, free=free), Weighting(*result.fit.scales)
-    problem = replace(problem, sights=sights, layout=layout, priors=(), weighting=weighting)
-    # Each keeps its old numbers, also the chosen one: what new observations change is no difference between lenses.
-    stays = plan.stays & result.stations.keys()
-    starts = [
-        replace(
-            result.estimate,
-            cameras={
-                name: lens.cameras[name].zoomed(ratio * lens.cameras[name].phi)[0] for name, ratio in ratios.items()
-            },
-            stations={**result.estimate.stations, **{name: lens.stations[name] for name in stays}},
-        )
-        for lens in known.lenses
-    ]
-    # quiet: a lens without a pose for the new observations says nothing about what moved
-    found = [solved_soon(problem, start) for start in starts]
-    here = {name: result.cameras[name] for name in plan.moved_cameras}
-    seen = [
-        replace(start, cameras={**start.cameras, **here}) if end is None else end.estimate
-        for start, end in zip(starts, found, strict=True)
-    ]
-    reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in sights.cameras}
-    lenses = OtherLenses(seen[0], tuple(seen[1:]), known.lens_weights, reach_px)
+    _, *said = refit_problem(plan, "pose-only", result.estimate)[0].priors
     # Each lens has its own phi: the prior of phi is from the chosen lens, and does not limit that of another one.
     stated, told = result.posterior.stated, {key for one in said for key in one.keys}
     phi = [key for key in stated.keys if key.quantity == "phi" and key not in told]
     posterior = replace(result.posterior, stated=stated.without(phi))
-    return replace(result, posterior=with_other_lenses(posterior, result.estimate, lenses))
+    return replace(result, posterior=with_other_lenses(posterior, result.estimate, plan.others))
 
 
 def _beside_rivals(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival]) -> Calibration:
@@ -342,7 +318,8 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
     kept = [name for name in result.cameras if name not in plan.stations.values()]
     if result.posterior is None or not kept:
         return result
-    before, known = plan.calibration.estimate, plan.calibration.uncertainty.posterior
+    earlier = plan.before or plan.calibration
+    before, known = earlier.estimate, earlier.uncertainty.posterior
     stations = {name: before.stations[name] for name in plan.stays if before.stations[name].camera in kept}
     estimate = replace(
         result.estimate,
@@ -378,13 +355,14 @@ def movements(before: Calibration, after: Calibration, what: str = "pose") -> di
     """Return how far (m; NaN where unknown) and by how much (degrees) each station that both have was moved, by a refit
     of `what`.
     """
-    known, old = before.uncertainty.posterior, before.estimate
     moves = {}
-    for name in filter(old.stations.__contains__, after.estimate.stations):
-        camera = old.stations[name].camera
+    for name in filter(before.estimate.stations.__contains__, after.estimate.stations):
+        camera = before.estimate.stations[name].camera
+        earlier = with_lens_of(before, after.cameras[camera], camera)
+        known, old = earlier.uncertainty.posterior, earlier.estimate
         let_go = loosened(what, camera, old.cameras[camera].lens)
         shift_m, turn = (
-            moved_from(before.prior_of(tuple(set(known.keys_of(old, name)) - let_go)), known, name, after.estimate)
+            moved_from(earlier.prior_of(tuple(set(known.keys_of(old, name)) - let_go)), known, name, after.estimate)
             if known.knows_station(name)
             else movement(after.estimate.stations[name].cam_from_world, old.stations[name].cam_from_world)
         )

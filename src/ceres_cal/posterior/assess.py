@@ -238,4 +238,18 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
         along = shifts_to_lenses(lenses, mine.keys[1:], nodes)
         shifts = over(np.swapaxes(along, 0, 1), mine.keys[1:], mine.keys)
         mixtures[name] = mine.shifted_also(weights, shifts, range(1, len(every)))
-    return replace(wider, mixtures=mixtures)
+    known = tuple(_as_open(own, posterior) for own in lenses.known)
+    return replace(wider, mixtures=mixtures, lens_information=known)
+
+
+def _as_open(known: Information, posterior: Posterior) -> Information:
+    """Return what is known with another lens, at least as wide along phi as with the chosen lens where that follows a
+    valley, in which normal equations hold only near the estimate.
+    """
+    for phi in posterior.followed_phi & {*known.keys}:
+        of_it = posterior.normal_of_lens.spread.sd[posterior.information.columns([phi])[0]]
+        along = known.spread.covariance[known.columns([phi])[0]]
+        own = np.sqrt(along[known.columns([phi])[0]])
+        if own < of_it:
+            known = known.widened((np.sqrt(of_it**2 - own**2) / own**2 * along)[None])
+    return known

@@ -19,6 +19,7 @@ from ceres_cal.posterior.bent import Ends
 from ceres_cal.posterior.mixture import Chain, Mixture
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import EXACT, Estimate, Information, Key, Station, over, pose_keys
+from ceres_cal.problem.quantities import every_key
 from ceres_cal.scene.camera import CameraFile, PoseFile
 
 
@@ -87,17 +88,32 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
         return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, lenses)
 
 
-class SeenFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Cameras and stations with one of several lenses."""
+class SeenFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """Cameras and stations with one of several lenses.
+
+    Attributes:
+        keys, information: what is known of their numbers, as a lower triangle, unless it is as with the lens before.
+    """
 
     cameras: dict[str, CameraFile]
     stations: dict[str, tuple[str, PoseFile]]
+    keys: list[Key] = []
+    information: list[float] = []
 
     @classmethod
-    def of(cls, estimate: Estimate) -> SeenFile:
-        """Return an estimate in the form of a file."""
-        stations = {name: (one.camera, PoseFile.of(one.cam_from_world)) for name, one in estimate.stations.items()}
-        return cls({name: CameraFile.of(one) for name, one in estimate.cameras.items()}, stations)
+    def every(cls, posterior: Posterior) -> list[SeenFile]:
+        """Return the lenses of a posterior in the form of a file."""
+        nothing = Information.nothing()
+        own, last = [nothing, *posterior.lens_information], nothing
+        own += [nothing] * (len(posterior.lenses) - len(own))
+        found = []
+        for estimate, known in zip(posterior.lenses, own, strict=False):
+            stations = {name: (one.camera, PoseFile.of(one.cam_from_world)) for name, one in estimate.stations.items()}
+            seen = cls({name: CameraFile.of(one) for name, one in estimate.cameras.items()}, stations)
+            if known is not last:
+                seen.keys, seen.information, last = list(known.keys), lower_triangle(known), known
+            found.append(seen)
+        return found
 
     def estimate(self) -> Estimate:
         """Return the estimate; raise InputError where a camera or a pose is invalid."""
@@ -151,7 +167,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             list(posterior.stated.keys),
             lower_triangle(posterior.stated),
             {name: MixtureFile.of(mixture) for name, mixture in posterior.mixtures.items()},
-            [SeenFile.of(estimate) for estimate in posterior.lenses],
+            SeenFile.every(posterior),
         )
 
     def posterior(self, known: Collection[Key]) -> Posterior:
@@ -169,14 +185,21 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         freedom = np.inf if self.freedom is None else self.freedom
         require_keys(self.stated_keys, self.keys, "posterior.stated_keys")
         stated = information_from(self.stated, self.stated_keys, "posterior.stated")
-        lenses = tuple(one.estimate() for one in self.lenses)
+        lenses, each = tuple(one.estimate() for one in self.lenses), [Information.nothing()]
+        for seen, there in zip(self.lenses, lenses, strict=True):
+            require_keys(seen.keys, every_key(there), "posterior.lenses.keys")
+            own = information_from(seen.information, seen.keys, "posterior.lenses.information")
+            each.append(own if seen.keys else each[-1])
         if any(
             not (0 < lens < len(lenses) and {component, alike} <= set(range(len(mixture.weights))))
             for mixture in mixtures.values()
             for component, (lens, alike) in mixture.lenses.items()
         ):
             raise InputError("posterior.mixtures names lenses that are not in posterior.lenses: calibrate again")
-        return Posterior(information, placements, freedom, mixtures, by_model or None, self.dependence, stated, lenses)
+        seen_by = lenses, tuple(each[2:])
+        return Posterior(
+            information, placements, freedom, mixtures, by_model or None, self.dependence, stated, *seen_by
+        )
 
 
 def require_alike(

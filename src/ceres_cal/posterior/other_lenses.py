@@ -35,9 +35,8 @@ from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 
 _PLACES = 12  # grid points along each side of the picture
-# Weights with which other lenses are followed at HEIGHTS_M. Above the floor phi matters, and the quadratic model is
-# inaccurate: with full weight, what lenses with another phi show there spoils the floor; with none, one map in ten was
-# 2.5 standard deviations off there.
+# Weights at HEIGHTS_M. Above the floor phi matters, and the quadratic model is inaccurate: full weight there spoils the
+# floor; with none, one map in ten was 2.5 standard deviations off.
 _PARTS = (1.0, 0.1)
 
 
@@ -47,7 +46,7 @@ class OtherLenses(Frozen):
     Attributes:
         near: estimate with the chosen lens. others: with other lenses. weights: of the others, probabilities or less.
         reach_px: camera -> distance from its principal point that observations reach: nothing is compared farther out.
-        failed: why nothing could be compared, else "".
+        failed: why nothing could be compared, else "". known: information about the numbers of each of the others.
     """
 
     near: Estimate
@@ -55,6 +54,7 @@ class OtherLenses(Frozen):
     weights: tuple[float, ...]
     reach_px: Mapping[str, float]
     failed: str = ""
+    known: tuple[Information, ...] = ()
 
     @cached_property
     def pixels(self) -> dict[str, Array]:
@@ -132,10 +132,9 @@ class LensSpread(Frozen):
 
     def _along(self, along: Key, step: Array) -> OpenDirection:
         """Return the direction, shortened such that phi changes by at most half of itself."""
-        most = 0.5
+        most, moving = 0.5, [i for i, value in enumerate(step) if value]
         phi = [(i, self.there.cameras[key.owner].phi) for i, key in enumerate(self.keys) if key.quantity == "phi"]
         far = max((abs(float(step[i])) / size for i, size in phi), default=0.0)
-        moving = [i for i, value in enumerate(step) if value]
         return OpenDirection(along, tuple(self.keys[i] for i in moving), step[moving] * min(1.0, most / max(far, most)))
 
 
@@ -175,12 +174,14 @@ def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate)
         return Estimate(cameras, {**end.stations, **seen}, {}, parts[0].structure)
 
     which = np.array([np.searchsorted(own, cuts[:-1], side="right") for own in bounds])
+    nothing = Information.nothing()
     return OtherLenses(
         combined([one.near for one in each]),
         tuple(combined([[*one.others, one.near][i] for one, i in zip(each, at, strict=True)]) for at in which.T),
         tuple(np.diff(cuts).tolist()),
         {name: reach_px for one in each for name, reach_px in one.reach_px.items()},
         "; ".join(filter(None, (one.failed for one in each))),
+        tuple(nothing.beside_all([*one.known, nothing][i] for one, i in zip(each, at, strict=True)) for at in which.T),
     )
 
 
@@ -197,8 +198,7 @@ def _distance_px(camera: Camera, places: Array) -> Array:
 
 def counted(weights: Sequence[float]) -> Array:
     """(L,) probabilities of other lenses, reduced such that some is left for the chosen one."""
-    most = 0.8  # upper limit of their sum
-    each = np.asarray(weights, dtype=float)
+    most, each = 0.8, np.asarray(weights, dtype=float)  # upper limit of their sum
     return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 

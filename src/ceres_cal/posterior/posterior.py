@@ -45,7 +45,7 @@ class Posterior(Frozen):
             or a refit kept them; "" -> distribution of everything else, where it is no single normal distribution.
             Standard deviations, bounds and maps are computed from these.
         lenses: estimate with the chosen lens, and those with others that predict as well, from the same observations;
-            components of the mixtures that are another lens show these.
+            components of the mixtures that are another lens show these. lens_information: about each of the others.
         stated: the part of the information that was known beforehand. It is never widened: see `wider`.
         by_model: information about the shared numbers by the model alone, with independent errors; None where that is
             `information` itself. dependence: basis of the difference; None where it was not estimated.
@@ -59,6 +59,7 @@ class Posterior(Frozen):
     dependence: Dependence | None = None
     stated: Information = field(default_factory=Information.nothing)
     lenses: tuple[Estimate, ...] = ()
+    lens_information: tuple[Information, ...] = ()
 
     __repr__ = brief
 
@@ -220,10 +221,9 @@ class Posterior(Frozen):
             whole = self.wider(whole, partial(Information.widened, shifts=over(shifts, mixture.keys, self.keys)))
         return whole
 
-    @property
-    def lens_weights(self) -> tuple[float, ...]:
-        """Probabilities of the lenses other than the chosen one."""
-        mixture = self.mixture()
+    def lens_weights(self, camera: str = "") -> tuple[float, ...]:
+        """Return the probabilities of the lenses other than the chosen one, for a camera or for everything."""
+        mixture = self.mixture(camera)
         of_lens = np.array([lens for lens, _ in mixture.lenses.values()], dtype=np.int64)
         weights = mixture.weights[np.array(list(mixture.lenses), dtype=np.int64)]
         return tuple(np.bincount(of_lens, weights, max(len(self.lenses), 1))[1:].tolist())
