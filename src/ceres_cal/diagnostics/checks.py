@@ -137,7 +137,7 @@ class DiagnosisCase(Case):
         labels: groups of observations that another feature explains. labels_tried: number of groups examined.
         calibration: from other observations, which may not hold on these; None where these are its own.
         as_built, effects: what the calibration found to differ from drawings, and other effects that displace the
-            observations; both were solved for.
+            observations; both were solved for. solved: the model before rejected observations were recalled.
     """
 
     inliers: Inliers
@@ -147,6 +147,11 @@ class DiagnosisCase(Case):
     calibration: Calibration | None
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
+    solved: Linearised | None = None
+
+    @property
+    def as_solved(self) -> Linearised:
+        return self.solved or self.model
 
 
 class TestResults(Frozen):

@@ -190,7 +190,7 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
         return case
     again = Weights(weights.inverse_sigma, used, np.where(model.used, weights.robust, 1.0))
     anew = make_linear_model(problem, estimate, equations, again)
-    return replace(case, model=replace(anew, known_noise=model.known_noise))
+    return replace(case, model=replace(anew, known_noise=model.known_noise), solved=model)
 
 
 def _judged(calibration: Calibration, observations: Observations, there: Residuals, new_data: bool) -> Inliers:

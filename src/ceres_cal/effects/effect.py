@@ -161,6 +161,11 @@ class Case(Frozen):
         return self.model.equations
 
     @property
+    def as_solved(self) -> Linearised:
+        """The model with the equations that took part in the solve; `model` may use more of them."""
+        return self.model
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         return tuple(self.estimate.cameras)
 

@@ -56,9 +56,9 @@ class JointStep(Frozen):
 
     @cached_property
     def moves(self) -> dict[Key, float]:
-        """The change of each free number."""
+        """The change of each free number: rejected observations did not move it."""
         keys = free_keys(self.case.estimate, self.case.problem.layout, self.case.problem.private)
-        steps = [self.case.model.taken_by(score.columns) @ amount for score, amount in self.causes]
+        steps = [self.case.as_solved.taken_by(score.columns) @ amount for score, amount in self.causes]
         return dict(zip(keys, np.sum(steps, axis=0).tolist(), strict=True)) if steps else {}
 
     def displaced(self, camera: str, pixels: Array) -> Array:
