@@ -145,6 +145,9 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     """Yield explanations that fit, and fit better than the known lens and field, with what to do."""
     misfit, old = _does_not_fit(search), old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
+    without = _without_worst(search, old)
+    if without is not None and without.is_better(known):
+        yield SolutionError(f"{misfit}{without.words}")
     if (flipped := _flipped(search, old, known)) is not None:
         yield SolutionError(f"{misfit}{flipped}")
     for name, observations in mistaken_targets(search.sight.observations).items():
@@ -169,11 +172,17 @@ def _does_not_fit(search: PoseSearch) -> str:
     return f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
 
 
-def _flipped(search: PoseSearch, old: list[Pose], known: float) -> str | None:
+def _flipped(search: PoseSearch, old: list[Pose], known: float, enough: int = 12) -> str | None:
     """Return how labels or the picture were flipped, where that explains the observations; else None. A picture is
     flipped about its middle, which is not the principal point, so flipped labels alone may not explain it.
+
+    A turned picture is one with the principal point on the other side of its middle. That also explains a part of one
+    misplaced line, so it must be better without the feature, too, that is explained worst.
+
+    Args:
+        enough: equations with which flipped pictures are tried. A pose has six numbers, and of five noisy clicks a
+            flipped picture explains some by chance.
     """
-    enough = 12  # equations: a pose has six numbers, and of five noisy clicks a flipped picture explains some by chance
     observations, last = search.sight.observations, np.array(search.camera.image_size) - 1.0
     mirrored = relabelled(observations, MIRRORED)
     every = [] if mirrored is None else [(mirrored, _MIRRORED)]
@@ -188,7 +197,50 @@ def _flipped(search: PoseSearch, old: list[Pose], known: float) -> str | None:
     good = [
         (one.misfit, words) for best, words in found for one in best if _good(one, known) and one.share > 1.0 - _FEW
     ]
+    if good and enough == 12 and (without := _without_worst(search, old)) is not None:
+        return _flipped(without.search, old, min((one.misfit for one in without.candidates), default=np.inf), 8)
     return min(good)[1] if good else None
+
+
+class _Without(NamedTuple):
+    """A search without one feature: its label, and poses with the known lens, the best one first."""
+
+    label: str
+    search: PoseSearch
+    candidates: list[PoseCandidate]
+
+    def is_better(self, known: float) -> bool:
+        """Return whether all else is explained by the known lens, and far better than with it, `known` nats."""
+        return bool(self.candidates) and _good(self.candidates[0], known) and self.candidates[0].share > 1.0 - _FEW
+
+    @property
+    def words(self) -> str:
+        """What is wrong, and what to do."""
+        return f"without {self.label} they do: it lies beside its place, or has a wrong label: correct or remove it"
+
+
+def _without_worst(search: PoseSearch, old: list[Pose]) -> _Without | None:
+    """Return the search without the feature that its best pose explains worst; None without a pose or feature left."""
+    fewest = 8  # features: without one of them the others still determine the pose by far
+    best = pose_candidates(search, old, patience=0)[:1]
+    sight, seen = search.sight, search.sight.observations
+    if not best or len(sight.point_rows) + len(sight.tracks) < fewest:
+        return None
+    columns = seen.points.feature, seen.curves.feature
+    rows, sigmas = (sight.point_rows, sight.curve_rows), search.residuals(best[0].pose).in_sigmas(sight, search.scales)
+    nats = [
+        np.bincount(feature[own], np.log1p(np.minimum(np.nan_to_num(off, nan=np.inf), 1e6) ** 2))
+        for feature, own, off in zip(columns, rows, sigmas, strict=True)
+    ]
+    which = int(np.argmax([one.max(initial=0.0) for one in nats]))
+    feature = int(np.argmax(nats[which]))
+    gone = rows[which][columns[which][rows[which]] == feature]
+    kept = [np.ones(len(own), dtype=bool) for own in columns]
+    kept[which][gone] = False
+    kind = "curve" if which else "point"
+    label = f"{kind} {seen.feature_name(kind, int(gone[0]))!r}"
+    rest = _seen_as(search, seen.part(*kept))
+    return _Without(label, rest, pose_candidates(rest, old, patience=0))
 
 
 def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
@@ -305,7 +357,10 @@ def supported(
         for search, solved in zip(searches, _solved_searches(plan, results[best]), strict=True):
             pose = solved.estimate.stations[search.sight.key.station].cam_from_world
             freed = candidate_at(solved, pose).misfit + _price(plan, best)
-            if (flipped := _flipped(search, old_poses(plan, search), freed)) is not None:
+            old = old_poses(plan, search)
+            if (without := _without_worst(search, old)) is not None and without.is_better(freed):
+                raise SolutionError(f"{_does_not_fit(search)}{without.words}")
+            if (flipped := _flipped(search, old, freed)) is not None:
                 raise SolutionError(f"{_does_not_fit(search)}{flipped}")
         # A noisy explanation may be something else; one with no more noise than what was asked for may have is taken.
         if judged(plan, best, results[best]).noisy and (other := _other_explanation(plan, searches)) is not None:
