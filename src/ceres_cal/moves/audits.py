@@ -254,7 +254,7 @@ def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]
     for scale in scales:
         yield (
             "another image size",
-            f"it was made for images {short(scale, 3)} times as large",
+            f"it was made for images {short(1.0 / scale, 3)} times as large",
             resized(camera, scale, (wide, high)),
         )
 
