@@ -253,6 +253,7 @@ def test_a_photographed_board_is_not_sheared(sony_boards: BoardDetections) -> No
 
 
 @pytest.mark.parametrize("is_another_kind", [False, True])
+@pytest.mark.thorough
 def test_points_of_another_kind_of_grid_are_no_inaccurate_board(is_another_kind: bool) -> None:
     """Circles of uneven rows have the names of even ones; a displacement by half a step must not explain them."""
     grid, rng, shown = circle_grid(8, 11, 0.02, 0.012, asymmetric=True), np.random.default_rng(0), list[np.ndarray]()

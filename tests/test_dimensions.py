@@ -181,6 +181,7 @@ def test_a_board_that_contradicts_the_field_is_named_and_solved_for() -> None:
         assert height.low < 4.5 < height.high and height.sd < 0.025  # 0.021 and 0.015 m
 
 
+@pytest.mark.thorough
 def test_a_board_as_it_was_measured_is_not_named() -> None:
     observations = shared_board(0.1)
     assert not diagnose(calibrate(observations), observations).findings

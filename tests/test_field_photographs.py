@@ -466,6 +466,7 @@ def test_the_real_photograph(
     assert figures["rms of line residuals, px"].value < 0.7  # 0.33 px
 
 
+@pytest.mark.thorough
 def test_the_script_prints_its_figures(capsys: pytest.CaptureFixture[str]) -> None:
     assert photographs.main(["--case", "rings", "--runs", "1", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)

@@ -723,6 +723,7 @@ def test_a_few_corners_before_which_the_papers_lens_folds_have_another() -> None
     assert any(one.label == "radial 2,3" and "folds" in one.failed for one in found.lens_choice.tried)
 
 
+@pytest.mark.thorough
 def test_two_cameras_by_a_few_corners_each() -> None:
     """It ended in a KeyError: the lenses of one camera were compared with the other camera included, which its corners
     do not show.

@@ -348,6 +348,7 @@ def test_another_explanation_counts_where_phi_is_followed() -> None:
     assert np.isclose(both.sd[phi], np.hypot(before.sd[phi], other.sd[phi]) / np.sqrt(2.0), rtol=0.01)  # 1e-4 measured
 
 
+@pytest.mark.thorough
 def test_another_zoom_is_found_where_the_picture_is_noisier(calibration: Calibration) -> None:
     """A warning that would do for a move must not exclude another zoom; the message was that nothing fits."""
     camera = replace(CAMERA, phi=0.97 * CAMERA.phi)

@@ -71,6 +71,7 @@ def test_the_command_corrects_them(say: Say, tmp_path: Path) -> None:
     assert not [one for one in said["rejected"] if one["kind"] == "curve" and one["feature"] == "HalfwayLine"][3:]
 
 
+@pytest.mark.thorough
 def test_two_of_four_curves_are_found_by_a_search() -> None:
     """No closed form suits three lines and a circle; they were refused for another reason after 14 s."""
     right = left_part()

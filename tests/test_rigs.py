@@ -176,6 +176,7 @@ def test_cameras_without_a_common_moment_have_no_baseline() -> None:
     assert "join --same-frame" in said and not any("nothing connects" in text for text in calibrate(rig).remarks)
 
 
+@pytest.mark.thorough
 def test_few_boards_before_a_pair_are_as_wide_as_they_are_off() -> None:
     """A weak direction was fixed together with the boards that both see, without a prior: sd of 3 to 490 mm."""
     off = []

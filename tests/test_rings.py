@@ -84,6 +84,7 @@ def test_the_papers_rings(tmp_path: Path, how: Photography) -> None:
     assert found.centre == pytest.approx(centre, abs=0.1)
 
 
+@pytest.mark.thorough
 def test_calibrates_from_photographed_rings_and_the_field(tmp_path: Path) -> None:
     found = detect_rings(taken(tmp_path, Photography()), RADII, camera="overhead")
     field = simulate(*built_in_scene("field-2004"), seed=2).observations

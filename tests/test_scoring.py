@@ -227,6 +227,7 @@ def test_ov_plane() -> None:
     assert answer.misfit.points_rms_px == pytest.approx(0.4746, abs=5e-4)
 
 
+@pytest.mark.thorough
 def test_few_clicks_are_noisier_by_chance() -> None:
     """The same camera with clicks twice as accurate: 11 of 60 pairs of about ten clicks said "is
     not good for these".

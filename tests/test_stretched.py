@@ -86,6 +86,7 @@ def test_square_pixels_stay_square(name: str) -> None:
 
 
 @pytest.mark.parametrize("aspects", partly([(1.02, 1.02), (1.0, 1.03), (1.0, 1.0)], always=[(1.0, 1.0), (1.02, 1.02)]))
+@pytest.mark.thorough
 def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, float]) -> None:
     """Both were taken as square to 0.0005: errors at robot height were 19 radii."""
     cameras = {name: _StretchedCamera(name, aspect) for name, aspect in zip(_CAMERAS, aspects, strict=True)}

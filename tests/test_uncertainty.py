@@ -421,6 +421,7 @@ def test_a_prior_on_phi_is_part_of_its_profile() -> None:
 
 
 @pytest.mark.parametrize("seed", partly(range(3), [0]))
+@pytest.mark.thorough
 def test_no_camera_a_hands_breadth_over_the_floor(seed: int) -> None:
     """At 1 degree a quarter of all least costs are at a phi of a few px, and so are those of two cameras."""
     for calibration in (
