@@ -16,28 +16,21 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.agreement import NOISIER, price_nats
+from ceres_cal.moves.misplaced import FEW, SUPPORTED, is_good, seen_as, without_worst
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, equations, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitPlan, mistaken_targets
-from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.posterior import LEAST_PROBABILITY
-from ceres_cal.problem import make_structure
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.symmetry import MIRRORED, TURNED
 
 # Share of the observations that another zoom must explain to be considered. Nothing changes from 0.33 to 0.67.
 _HALF = 0.5
-# Share of observations that may be rejected where another lens is said to explain the rest. Nothing changes from half
-# to double.
-_FEW = 0.2
 # Rate at which an unchanged lens is doubted. A doubt only costs time, because other explanations must be supported,
 # too. Nothing changes from half to double.
 _RARE = 1e-4
 # Factor on the old calibration's noise from which on nothing counts as explained, unless most observations lie where
 # they should. Nothing changes from half to double.
 _TOO_NOISY = 4.0
-# Nats by which another explanation must be better than one that the user stated: a factor of 20 000. Nothing changes
-# from half to double. Where nothing was stated the better one is taken: a freed number has its price already.
-_SUPPORTED = 10.0
 # A camera whose labels are turned seems to have moved farther than the first (m); with the labels turned back it is
 # within the second of its old place (m), turned by less than the third (rad). Nothing changes from half to double.
 _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
@@ -69,14 +62,21 @@ class OtherChangeError(SolutionError):
 
     Attributes:
         what: one of `WHAT` that explains the observations. rivals: further explanations that may be true. found: the
-            calibration if this one is, where it was solved for.
+            calibration if this one is, where it was solved for. is_doubtful: whether one misplaced feature explains as
+            much.
     """
 
     def __init__(
-        self, message: str, what: str, rivals: tuple[Rival, ...] = (), found: Calibration | None = None
+        self,
+        message: str,
+        what: str,
+        rivals: tuple[Rival, ...] = (),
+        found: Calibration | None = None,
+        *,
+        is_doubtful: bool = False,
     ) -> None:
         super().__init__(f"{message}: refit with --what {what}")
-        self.what, self.rivals, self.found = what, rivals, found
+        self.what, self.rivals, self.found, self.is_doubtful = what, rivals, found, is_doubtful
 
 
 def labels_turned(pose: Pose, old: Pose) -> tuple[float, float] | None:
@@ -145,16 +145,16 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     """Yield explanations that fit, and fit better than the known lens and field, with what to do."""
     misfit, old = _does_not_fit(search), old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
-    without = _without_worst(search, old)
-    if without is not None and without.is_better(known):
-        yield SolutionError(f"{misfit}{without.words}")
     if (flipped := _flipped(search, old, known)) is not None:
         yield SolutionError(f"{misfit}{flipped}")
     for name, observations in mistaken_targets(search.sight.observations).items():
-        if _fits(_seen_as(search, observations), old, known):
+        if _fits(seen_as(search, observations), old, known):
             yield SolutionError(f"{misfit}on {name} they do: this is the wrong field: correct the target's dimensions")
+    without = without_worst(search, old)
+    if without is not None and without.is_better(known):
+        yield SolutionError(f"{misfit}{without.words}")
     zoomed = zoomed_search(search, old)
-    if zoomed is not None and _good(zoomed[1], known) and plan.what not in ("zoom", "everything"):
+    if zoomed is not None and is_good(zoomed[1], known) and plan.what not in ("zoom", "everything"):
         phi = zoomed[0].camera.phi
         before = search.camera.phi
         message = f"{misfit}with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}"
@@ -164,7 +164,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     if isinstance(fresh, CalibrationError):
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
-    if noise < NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
+    if noise < NOISIER and len(fresh.outliers) < FEW * (fresh.fit.points + fresh.fit.curves):
         yield SolutionError(f"{misfit}with another lens they do: {WORDS['everything']}: calibrate it anew")
 
 
@@ -193,74 +193,24 @@ def _flipped(search: PoseSearch, old: list[Pose], known: float, enough: int = 12
             for one in (observations.points, observations.curves)
         )
         every.append((replace(observations, points=points, curves=curves), words))
-    found = [(pose_candidates(_seen_as(search, seen), old, patience=0)[:1], words) for seen, words in every]
+    found = [(pose_candidates(seen_as(search, seen), old, patience=0)[:1], words) for seen, words in every]
     good = [
-        (one.misfit, words) for best, words in found for one in best if _good(one, known) and one.share > 1.0 - _FEW
+        (one.misfit, words, n)
+        for n, (best, words) in enumerate(found)
+        for one in best
+        if is_good(one, known) and one.share > 1.0 - FEW
     ]
-    if good and enough == 12 and (without := _without_worst(search, old)) is not None:
-        return _flipped(without.search, old, min((one.misfit for one in without.candidates), default=np.inf), 8)
-    return min(good)[1] if good else None
-
-
-class _Without(NamedTuple):
-    """A search without one feature: its label, and poses with the known lens, the best one first."""
-
-    label: str
-    search: PoseSearch
-    candidates: list[PoseCandidate]
-
-    def is_better(self, known: float) -> bool:
-        """Return whether all else is explained by the known lens, and far better than with it, `known` nats."""
-        return bool(self.candidates) and _good(self.candidates[0], known) and self.candidates[0].share > 1.0 - _FEW
-
-    @property
-    def words(self) -> str:
-        """What is wrong, and what to do."""
-        return f"without {self.label} they do: it lies beside its place, or has a wrong label: correct or remove it"
-
-
-def _without_worst(search: PoseSearch, old: list[Pose]) -> _Without | None:
-    """Return the search without the feature that its best pose explains worst; None without a pose or feature left."""
-    fewest = 8  # features: without one of them the others still determine the pose by far
-    best = pose_candidates(search, old, patience=0)[:1]
-    sight, seen = search.sight, search.sight.observations
-    if not best or len(sight.point_rows) + len(sight.tracks) < fewest:
+    if not good:
         return None
-    columns = seen.points.feature, seen.curves.feature
-    rows, sigmas = (sight.point_rows, sight.curve_rows), search.residuals(best[0].pose).in_sigmas(sight, search.scales)
-    nats = [
-        np.bincount(feature[own], np.log1p(np.minimum(np.nan_to_num(off, nan=np.inf), 1e6) ** 2))
-        for feature, own, off in zip(columns, rows, sigmas, strict=True)
-    ]
-    which = int(np.argmax([one.max(initial=0.0) for one in nats]))
-    feature = int(np.argmax(nats[which]))
-    gone = rows[which][columns[which][rows[which]] == feature]
-    kept = [np.ones(len(own), dtype=bool) for own in columns]
-    kept[which][gone] = False
-    kind = "curve" if which else "point"
-    label = f"{kind} {seen.feature_name(kind, int(gone[0]))!r}"
-    rest = _seen_as(search, seen.part(*kept))
-    return _Without(label, rest, pose_candidates(rest, old, patience=0))
+    _, words, number = min(good)
+    if enough == 12 and number >= len(every) - len(pictures) and (without := without_worst(search, old)) is not None:
+        return _flipped(without.search, old, without.misfit, 8)
+    return words
 
 
 def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
     candidates = pose_candidates(search, old, patience=0)
-    return bool(candidates) and _good(candidates[0], known)
-
-
-def _good(candidate: PoseCandidate, known: float) -> bool:
-    """Return whether a pose explains the observations about as well as the old calibration did its own, and better than
-    the known lens and labels, whose least misfit is `known`: stray observations fit neither.
-    """
-    return candidate.fits and candidate.scale < NOISIER and candidate.misfit < known - _SUPPORTED
-
-
-def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
-    """Return the search with renamed observations or exchanged targets; the structure of targets is left out."""
-    sights = gather_sights(observations)
-    number = sights.keys.index(search.sight.key)
-    estimate = replace(search.estimate, structure=make_structure(observations.targets, {}))
-    return replace(search, sight=sights[number], estimate=estimate)
+    return bool(candidates) and is_good(candidates[0], known)
 
 
 def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, PoseCandidate] | None:
@@ -348,18 +298,19 @@ def supported(
     is_free = not plan.is_stated and not any(conflict.kind == "prior" for conflict in result.conflicts)
     easily = {plan.what, *(wider[:2] if is_free else ())}
     misfits, let_go = _misfits(plan, quiet), {what: len(plan.loosened(what)) for what in quiet}
-    scores = {w: misfits[w] + _price(plan, w) + _SUPPORTED * (w not in easily) for w in quiet}
+    scores = {w: misfits[w] + _price(plan, w) + SUPPORTED * (w not in easily) for w in quiet}
     best = min(scores, key=scores.__getitem__)
     # An explanation that gains no more than chance does with a freed number (Akaike's criterion) is no reason to doubt.
     speak_for = [w for w in quiet if w in easily and misfits[w] + let_go[w] <= misfits[plan.what] + let_go[plan.what]]
     rivals = tuple(_rivals({what: scores[what] for what in speak_for}, best, results, solved_with))
     if best != plan.what:
+        misplaced = ""
         for search, solved in zip(searches, _solved_searches(plan, results[best]), strict=True):
             pose = solved.estimate.stations[search.sight.key.station].cam_from_world
             freed = candidate_at(solved, pose).misfit + _price(plan, best)
             old = old_poses(plan, search)
-            if (without := _without_worst(search, old)) is not None and without.is_better(freed):
-                raise SolutionError(f"{_does_not_fit(search)}{without.words}")
+            if (without := without_worst(search, old)) is not None and without.is_better(freed):
+                misplaced = f"{_does_not_fit(search)}{without.words}; or else "
             if (flipped := _flipped(search, old, freed)) is not None:
                 raise SolutionError(f"{_does_not_fit(search)}{flipped}")
         # A noisy explanation may be something else; one with no more noise than what was asked for may have is taken.
@@ -367,11 +318,12 @@ def supported(
             raise other
         gain = scores[plan.what] - scores[best]
         raise OtherChangeError(
-            f"the data show that {WORDS[best]}{_changes(plan, best, results[best])}; the known lens explains "
-            f"them less well (by {gain:.0f} nats)",
+            f"{misplaced}the data show that {WORDS[best]}{_changes(plan, best, results[best])}; the known lens "
+            f"explains them less well (by {gain:.0f} nats)",
             best,
             rivals,
             results[best],
+            is_doubtful=bool(misplaced),
         )
     if judged(plan, plan.what, result).noise >= _TOO_NOISY:
         if not _explains(plan, result):

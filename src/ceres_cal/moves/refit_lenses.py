@@ -74,27 +74,23 @@ class _SeenLens(Frozen):
     """A lens of the old posterior, with what the new observations say of it.
 
     Attributes:
-        plan: with the lens. problem: of the refit with it. start: before its solve. end: the solution, None where there
-            is none. weight: the logarithm of its probability, plus a constant.
+        plan: with the lens. problem: of the refit with it. end: its solution, None where there is none. shown: with phi
+            free, as the lens appears beside the others. weight: the logarithm of its probability, plus a constant.
     """
 
     plan: RefitPlan
     problem: Problem
-    start: Estimate
     end: Solution | None
+    shown: Estimate
     weight: float
-
-    @property
-    def estimate(self) -> Estimate:
-        """The best estimate with it."""
-        return self.start if self.end is None else self.end.estimate
 
     def information(self, cameras: Collection[str]) -> Information:
         """Return what is known with it of some cameras and their stations, by old and new observations."""
-        stations = self.estimate.stations
+        estimate = self.shown if self.end is None else self.end.estimate
+        stations = estimate.stations
         owners = {("camera", name) for name in cameras}
         owners |= {("station", name) for name, one in stations.items() if one.camera in cameras}
-        every = information(self.problem, self.estimate).shared
+        every = information(self.problem, estimate).shared
         return every.marginal([key for key in every.keys if key[:2] in owners])
 
 
@@ -127,11 +123,18 @@ def _seen(plan: RefitPlan, start: Estimate, ratios: Mapping[str, float], probabi
     problem = replace(refit_problem(plan, plan.what, start)[0], weighting=weighting)
     # First the poses alone: from a wrong pose, the first step may lead to an impossible lens.
     posing, layout = refit_problem(plan, "pose-only", start)
-    layout = replace(layout, stations=plan.moved, free={name: free[:0] for name, free in layout.free.items()})
-    posed = solved_soon(replace(posing, layout=layout, priors=(), weighting=weighting), start)
+    posing = replace(posing, priors=(), weighting=weighting)
+    held = replace(layout, stations=plan.moved, free={name: free[:0] for name, free in layout.free.items()})
+    posed = solved_soon(replace(posing, layout=held), start)
     end = None if posed is None else solved_soon(problem, posed.estimate) or posed
     weight = np.log(max(probability, np.finfo(float).tiny)) - (np.inf if end is None else end.cost)
-    return _SeenLens(plan, problem, start, end, float(weight))
+    # Beside the others it is shown with its own phi by these observations: where a zoom that nobody stated cannot be
+    # seen, phi was otherwise known and wrong twice as often. A valley along phi contains all of that.
+    here = start if end is None else end.estimate
+    followed = (plan.before or plan.calibration).uncertainty.posterior.followed
+    own = {name: free[:0] if name in followed else free[free == 0] for name, free in layout.free.items()}
+    alone = None if end is None else solved_soon(replace(posing, layout=replace(held, free=own)), here)
+    return _SeenLens(plan, problem, end, here if alone is None else alone.estimate, float(weight))
 
 
 def _among(plan: RefitPlan, every: Sequence[_SeenLens], number: int, likely: Array) -> RefitPlan:
@@ -146,7 +149,7 @@ def _among(plan: RefitPlan, every: Sequence[_SeenLens], number: int, likely: Arr
     def there(one: _SeenLens, before: Estimate) -> Estimate:
         cameras = {name: before.cameras[name] for name in still}
         stations = {name: own for name, own in before.stations.items() if own.camera in still}
-        here = one.estimate
+        here = one.shown
         return replace(here, cameras={**here.cameras, **cameras}, stations={**here.stations, **stations})
 
     near = there(every[number], earlier[0])
@@ -158,7 +161,7 @@ def _among(plan: RefitPlan, every: Sequence[_SeenLens], number: int, likely: Arr
         known=tuple(one.information(moved) for one in others),
     )
     own = every[number]
-    return replace(own.plan, near=None if own.end is None else own.estimate, others=lenses)
+    return replace(own.plan, near=None if own.end is None else own.end.estimate, others=lenses)
 
 
 def _reach_px(plan: RefitPlan, near: Estimate) -> dict[str, float]:

@@ -135,7 +135,7 @@ def _refitted_as_changed(
     try:
         return _refitted(plan, observations, progress)
     except OtherChangeError as change:  # reads: "the data show that the zoom was changed", or the error
-        if plan.is_stated or change.what == "everything":
+        if plan.is_stated or change.is_doubtful or change.what == "everything":
             raise
         return _refitted(changed(change.what), observations, progress, change)
 
