@@ -654,9 +654,16 @@ def test_a_refit_takes_the_lens_that_new_observations_make_likeliest() -> None:
     assert before.cameras["overhead"].lens.kind == "radial"
     assert after.cameras["overhead"].lens.kind == "kannala-brandt" == after.options.lens
     assert after.refitted is not None and after.refitted.what == "pose" and not after.conflicts
+    assert any("far likelier with a kannala-brandt lens" in one for one in after.remarks)
     assert off < 1.5  # 0.8 measured
     posterior = after.uncertainty.posterior
     assert abs(after.cameras["overhead"].phi - 880.0) < 3.0 * posterior.sd_of("camera", "overhead", "phi")
+
+
+def test_held_intrinsics_stay_although_another_lens_is_likelier() -> None:
+    before, new, *_ = _of_a_fisheye()
+    with pytest.raises(SolutionError, match="unless the lens is wrong there"):
+        refit(before, new, "pose-only")
 
 
 def test_what_is_known_of_other_lenses_is_kept_and_counts_once(tmp_path: Path) -> None:

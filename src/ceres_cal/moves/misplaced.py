@@ -55,7 +55,8 @@ class Without(NamedTuple):
     @property
     def words(self) -> str:
         """What is wrong, and what to do."""
-        return f"without {self.label} they do: it lies beside its place, or has a wrong label: correct or remove it"
+        what = "it lies beside its place or has a wrong label, unless the lens is wrong there"
+        return f"without {self.label} they do: {what}: correct or remove it"
 
 
 def without_worst(search: PoseSearch, old: list[Pose]) -> Without | None:

@@ -29,7 +29,7 @@ def with_lenses(plan: RefitPlan, start_of: Callable[[RefitPlan], Estimate], numb
 
     Args:
         start_of: returns where a plan's solve starts, or raises where nothing fits. number: the lens to take in any
-            case, in place of the likeliest.
+            case, in place of the likeliest; where intrinsics are held, it is the chosen one.
     """
     # Nats by which another lens must be likelier than the chosen one, as among lenses of few observations; and by which
     # one without a formula, which few programs know, must be likelier than one with a formula.
@@ -47,6 +47,7 @@ def with_lenses(plan: RefitPlan, start_of: Callable[[RefitPlan], Estimate], numb
     weights = np.array([one.weight for one in every])
     if not every or not np.isfinite(weights.max()):
         return plan
+    number = 0 if plan.what == "pose-only" else number
     if number is None:
         without_formula = np.array([any(c.lens.roughness for c in one.cameras.values()) for one in known.lenses])
         ahead = weights - strong * without_formula
@@ -120,7 +121,8 @@ def _seen(plan: RefitPlan, start: Estimate, ratios: Mapping[str, float], probabi
     zoomed = {name: known.cameras[name].zoomed(ratio * known.cameras[name].phi)[0] for name, ratio in ratios.items()}
     stays = {name: known.stations[name] for name in plan.stays}
     start = replace(start, cameras={**known.cameras, **zoomed}, stations={**start.stations, **stays})
-    problem = replace(refit_problem(plan, plan.what, start)[0], weighting=weighting)
+    what = "pose" if plan.what == "pose-only" else plan.what  # held numbers are no better known than others
+    problem = replace(refit_problem(plan, what, start)[0], weighting=weighting)
     # First the poses alone: from a wrong pose, the first step may lead to an impossible lens.
     posing, layout = refit_problem(plan, "pose-only", start)
     posing = replace(posing, priors=(), weighting=weighting)
@@ -161,7 +163,9 @@ def _among(plan: RefitPlan, every: Sequence[_SeenLens], number: int, likely: Arr
         known=tuple(one.information(moved) for one in others),
     )
     own = every[number]
-    return replace(own.plan, near=None if own.end is None else own.end.estimate, others=lenses)
+    if own.end is None or plan.what == "pose-only":
+        return replace(own.plan, others=lenses)
+    return replace(own.plan, near=own.end.estimate, others=lenses)
 
 
 def _reach_px(plan: RefitPlan, near: Estimate) -> dict[str, float]:

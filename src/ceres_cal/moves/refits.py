@@ -6,7 +6,7 @@ old posterior is one more prior, as a full matrix.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -95,15 +95,9 @@ def refit(
     # reads: "no explanation fits ...", or that something else has changed, where more noise is less likely
     found = attempt(partial(_refitted_as_changed, plan, observations, progress, changed), SolutionError)
     if (least := _least_nats(plan, found)) is not None and (likeliest := _likeliest(plan)) is not plan:
+        likeliest = with_lenses(replace(asked, scales=likeliest.scales), _start, plan.lens)
         # quiet: nothing fits at more noise, either, and the answer is what was found before
-        noisier = attempt(
-            partial(
-                _refitted,
-                with_lenses(replace(asked, scales=likeliest.scales), _start, plan.lens),
-                observations,
-                progress,
-            )
-        )
+        noisier = attempt(partial(_refitted, likeliest, observations, progress))
         if isinstance(noisier, Calibration) and _nats(plan, plan.what, noisier) < least:
             times = f"{_noise(plan, noisier):.1f} times as noisy as those of the calibration before"
             return replace(noisier, remarks=(*noisier.remarks, f"the new observations are {times}"))
@@ -207,7 +201,17 @@ def _refitted(
         seen = (*seen, calibration.digest)
     refitted = RefitRecord(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
     warnings = (*_warnings(plan, result), *([_TWICE] if observations.digest in seen else []))
-    return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
+    remarks = (*result.remarks, *_of_lenses(plan))
+    return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings, remarks=remarks)
+
+
+def _of_lenses(plan: RefitPlan) -> Iterator[str]:
+    """Yield which cameras have another lens than before."""
+    earlier = plan.before or plan.calibration
+    for name in sorted(plan.moved_cameras) if plan.lens else ():
+        before, now = earlier.cameras[name].lens, plan.calibration.cameras[name].lens
+        other = f"a {now.kind} lens" if now.kind != before.kind else f"another {now.kind} lens"
+        yield f"camera {name!r}: the new observations are far likelier with {other}, which predicted as well before"
 
 
 _TWICE = "the old calibration was made from these observations, too: they are counted twice now"
