@@ -137,10 +137,13 @@ def _run(args: CalibrateArguments) -> Document:
     options = _options(args, observations, fixed=fixed, powers=powers)
     with ProgressBar(args.silent) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
-        from ceres_cal.calibration.renaming import find_renaming
 
         workers = {} if client is None else {"client": client}
-        renaming = find_renaming(observations, options) if args.mend_labels else None
+        renaming = None
+        if args.mend_labels:
+            from ceres_cal.calibration.renaming import find_renaming
+
+            renaming = find_renaming(observations, options)
         observations = renaming.corrected(observations) if renaming else observations
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
         wrong = tuple(diagnostics.renamings(observations, calibration)) if calibration.rounds else ()

@@ -153,17 +153,16 @@ def _held_out(choices: Mapping[str, LensChoice], options: Options) -> Section:
 # ---- tables ---------------------------------------------------------------------------------------------------------
 
 
-_COLUMNS = ("points", "points_rms_px", "curves", "curves_rms_px", "rms_mm", "rms_sigma", "rejected")
-_PLACES = (0, 3, 0, 3, 2, 3, 0)
-"""Columns of a table of groups, and their decimals; counts have none."""
-
-
 def summary_table(head: str, summary: Summary, rows: Sequence[int], names: Sequence[str] = ()) -> Table:
     """Table of some groups of observations, given by number; `names` replaces the summary's own names."""
-    columns = (
-        [fixed(value, places) if places else grouped(value) for value in getattr(summary, name)[list(rows)].tolist()]
-        for name, places in zip(_COLUMNS, _PLACES, strict=True)
-    )
+    measured = {"points_rms_px": 3, "curves_rms_px": 3, "rms_mm": 2, "rms_sigma": 3}  # decimals; counts have none
+    shown = ("points", "points_rms_px", "curves", "curves_rms_px", "rms_mm", "rms_sigma", "rejected")
+
+    def column(name: str) -> list[str]:
+        values = getattr(summary, name)[list(rows)].tolist()
+        return [fixed(value, measured[name]) if name in measured else grouped(value) for value in values]
+
+    columns = map(column, shown)
     cells = zip(names or [summary.names[i] for i in rows], *columns, strict=True)
     return Table((head, "points", "rms px", "curves", "rms px", "mm", "sigma", "out"), tuple(cells))
 
