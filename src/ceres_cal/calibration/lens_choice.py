@@ -193,8 +193,8 @@ class Comparison(Frozen):
             assert one.of.normals is not None  # it predicts
             every = one.of.normals.information(one.of.to_nothing(one.form), posterior.stated)
             known = (Information(every.keys, every.matrix / widened**2),) * len(ends)
-            found = replace(found, others=(*found.others, *ends), known=(*found.known, *known))
-            found = replace(found, weights=(*found.weights, *weights))
+            others, known = (*found.others, *ends), (*found.known, *known)
+            found = replace(found, others=others, weights=(*found.weights, *weights), known=known)
         # More observations than took part leave smaller differences by chance, so the weights are reduced by their
         # share.
         share = max(self.share, least_share) / max(left, LEAST_PROBABILITY)

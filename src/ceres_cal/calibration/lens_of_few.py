@@ -56,8 +56,7 @@ def others_of_few(observations: Observations, label: str, options: Options, near
     reach_px = {name: one.reach_px for name, one in profiles_of(near, sights).items()}
 
     def known(form: Form, there: Estimate) -> Information:
-        every = information(problem_of(sights, form.of(options), there), there).shared
-        return every.marginal([key for key in every.keys if key.kind in ("camera", "station")])
+        return information(problem_of(sights, form.of(options), there), there).shared.of_cameras
 
     others = {form: end.estimate for form, end in solved.items() if form.label != label}
     every = tuple(known(form, there) for form, there in others.items())

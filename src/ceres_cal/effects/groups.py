@@ -114,10 +114,8 @@ class GroupNormals(Frozen):
 
     def information(self, held: Collection[Key], stated: Information) -> Information:
         """Return what is known of a camera and its stations if some numbers are held, with further information."""
-        every = (Information(self.keys, self._whole) + stated.marginal(stated.among(self.keys))).given(
-            [key for key in self.keys if key not in held]
-        )
-        return every.marginal([key for key in every.keys if key.kind in ("camera", "station")])
+        every = Information(self.keys, self._whole) + stated.marginal(stated.among(self.keys))
+        return every.given([key for key in self.keys if key not in held]).of_cameras
 
     def root(self, held: Collection[Key], stated: Array | float = 0.0) -> Array:
         """(K, K) a root of the covariance of the numbers, if some are held.

@@ -172,7 +172,7 @@ def _does_not_fit(search: PoseSearch) -> str:
     return f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
 
 
-def _flipped(search: PoseSearch, old: list[Pose], known: float, enough: int = 12) -> str | None:
+def _flipped(search: PoseSearch, old: list[Pose], known: float, *, confirms: bool = False) -> str | None:
     """Return how labels or the picture were flipped, where that explains the observations; else None. A picture is
     flipped about its middle, which is not the principal point, so flipped labels alone may not explain it.
 
@@ -180,9 +180,11 @@ def _flipped(search: PoseSearch, old: list[Pose], known: float, enough: int = 12
     misplaced line, so it must be better without the feature, too, that is explained worst.
 
     Args:
-        enough: equations with which flipped pictures are tried. A pose has six numbers, and of five noisy clicks a
-            flipped picture explains some by chance.
+        confirms: whether this is that second answer, without a feature.
     """
+    # Equations with which flipped pictures are tried: a pose has six numbers, and of five noisy clicks a flipped
+    # picture explains some by chance.
+    enough = 8 if confirms else 12
     observations, last = search.sight.observations, np.array(search.camera.image_size) - 1.0
     mirrored = relabelled(observations, MIRRORED)
     every = [] if mirrored is None else [(mirrored, _MIRRORED)]
@@ -203,8 +205,9 @@ def _flipped(search: PoseSearch, old: list[Pose], known: float, enough: int = 12
     if not good:
         return None
     _, words, number = min(good)
-    if enough == 12 and number >= len(every) - len(pictures) and (without := without_worst(search, old)) is not None:
-        return _flipped(without.search, old, without.misfit, 8)
+    is_picture = number >= len(every) - len(pictures)
+    if is_picture and not confirms and (without := without_worst(search, old)) is not None:
+        return _flipped(without.search, old, without.misfit, confirms=True)
     return words
 
 

@@ -133,7 +133,7 @@ def _seen(plan: RefitPlan, start: Estimate, ratios: Mapping[str, float], probabi
     # Beside the others it is shown with its own phi by these observations: where a zoom that nobody stated cannot be
     # seen, phi was otherwise known and wrong twice as often. A valley along phi contains all of that.
     here = start if end is None else end.estimate
-    followed = (plan.before or plan.calibration).uncertainty.posterior.followed
+    followed = plan.earlier.uncertainty.posterior.followed
     own = {name: free[:0] if name in followed else free[free == 0] for name, free in layout.free.items()}
     alone = None if end is None else solved_soon(replace(posing, layout=replace(held, free=own)), here)
     return _SeenLens(plan, problem, end, here if alone is None else alone.estimate, float(weight))
@@ -145,8 +145,8 @@ def _among(plan: RefitPlan, every: Sequence[_SeenLens], number: int, likely: Arr
     earlier, moved = plan.calibration.uncertainty.posterior.lenses, plan.moved_cameras
     still = plan.known.cameras.keys() - moved
     # Cameras that were not observed refer to the lenses by their numbers: those stay, and the two change places.
-    at = [n for n in range(1, len(every)) if still or likely[n if n != number else 0] >= least]
-    others = [every[n if n != number else 0] for n in at]
+    places = [(n, n if n != number else 0) for n in range(1, len(every))]
+    places = [(at, n) for at, n in places if still or likely[n] >= least]
 
     def there(one: _SeenLens, before: Estimate) -> Estimate:
         cameras = {name: before.cameras[name] for name in still}
@@ -157,10 +157,10 @@ def _among(plan: RefitPlan, every: Sequence[_SeenLens], number: int, likely: Arr
     near = there(every[number], earlier[0])
     lenses = OtherLenses(
         near,
-        tuple(there(one, earlier[n]) for one, n in zip(others, at, strict=True)),
-        tuple(likely[n if n != number else 0] for n in at),
+        tuple(there(every[n], earlier[at]) for at, n in places),
+        tuple(likely[n] for _, n in places),
         _reach_px(plan, near),
-        known=tuple(one.information(moved) for one in others),
+        known=tuple(every[n].information(moved) for _, n in places),
     )
     own = every[number]
     if own.end is None or plan.what == "pose-only":

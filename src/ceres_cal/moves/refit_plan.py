@@ -10,7 +10,7 @@ from collections.abc import Collection
 import numpy as np
 
 from ceres_cal.base import Frozen, InputError, Pose, no_such, replace
-from ceres_cal.calibration import Calibration
+from ceres_cal.calibration import Calibration, RefitRecord
 from ceres_cal.calibration.calibration import loosened, still_known
 from ceres_cal.calibration.renaming import relabelled
 from ceres_cal.moves.agreement import matched, require_posterior
@@ -139,7 +139,12 @@ class RefitPlan(Frozen):
     @property
     def is_repeated(self) -> bool:
         """Whether the old calibration is a refit to these observations: it includes them already."""
-        return self.calibration.refitted is not None and self.calibration.digest == self.sights.observations.digest
+        return _repeated(self.calibration, self.sights.observations) is not None
+
+    @property
+    def earlier(self) -> Calibration:
+        """The old calibration with the lens that was chosen then."""
+        return self.before or self.calibration
 
     def loosened(self, what: str) -> frozenset[Key]:
         """Return the intrinsics about which nothing counts as known any more."""
@@ -190,15 +195,15 @@ def make_plan(
     stays = frozenset(n for n, s in old.items() if n not in chosen and (n in stations or s.camera not in elsewhere))
     asked = asked or RefitOptions()
     observed = _turned(observed) if asked.labels == "turned" else observed
-    same = calibration.digest == observations.digest  # then it is the same refit again
-    if same and calibration.refitted is None:
+    repeated = _repeated(calibration, observations)
+    if calibration.digest == observations.digest and repeated is None:
         raise InputError(
             "the calibration was made from these observations, so a refit to them changes nothing: give new "
             "observations, or calibrate again with additional priors"
         )
-    options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
+    options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if repeated else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # those are the old calibration's
-    scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
+    scales = repeated.scales if repeated else calibration.fit.scales
     prior = carried_prior(calibration, observations, stays, of_lens=what in ("pose", "pose-only"))
     placed = {name: old[name] for name in old if name in stays}
     placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
@@ -223,6 +228,11 @@ def make_plan(
     )
 
 
+def _repeated(calibration: Calibration, observations: Observations) -> RefitRecord[GaussianPrior] | None:
+    """Return the refit by which the calibration was made from these observations; None where it was made otherwise."""
+    return calibration.refitted if calibration.digest == observations.digest else None
+
+
 def _turned(observations: Observations) -> Observations:
     turned = relabelled(observations, TURNED)
     if turned is None:
@@ -242,9 +252,8 @@ def carried_prior(
     Args:
         of_lens: return the prior if the chosen lens is right.
     """
-    if calibration.refitted is not None and calibration.digest == observations.digest:
-        before = calibration.refitted.prior
-        return before.without([key for key in before.keys if not _is_kept(key, stays)])
+    if (repeated := _repeated(calibration, observations)) is not None:
+        return repeated.prior.without([key for key in repeated.prior.keys if not _is_kept(key, stays)])
     kept = [key for key in calibration.uncertainty.posterior.keys if _is_kept(key, stays)]
     return calibration.prior_of(kept, of_lens=of_lens)
 

@@ -207,9 +207,8 @@ def _refitted(
 
 def _of_lenses(plan: RefitPlan) -> Iterator[str]:
     """Yield which cameras have another lens than before."""
-    earlier = plan.before or plan.calibration
     for name in sorted(plan.moved_cameras) if plan.lens else ():
-        before, now = earlier.cameras[name].lens, plan.calibration.cameras[name].lens
+        before, now = plan.earlier.cameras[name].lens, plan.calibration.cameras[name].lens
         other = f"a {now.kind} lens" if now.kind != before.kind else f"another {now.kind} lens"
         yield f"camera {name!r}: the new observations are far likelier with {other}, which predicted as well before"
 
@@ -322,8 +321,7 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
     kept = [name for name in result.cameras if name not in plan.stations.values()]
     if result.posterior is None or not kept:
         return result
-    earlier = plan.before or plan.calibration
-    before, known = earlier.estimate, earlier.uncertainty.posterior
+    before, known = plan.earlier.estimate, plan.earlier.uncertainty.posterior
     stations = {name: before.stations[name] for name in plan.stays if before.stations[name].camera in kept}
     estimate = replace(
         result.estimate,

@@ -146,6 +146,11 @@ class Information(Frozen):
             tuple(keys), without(here, coupling, self.matrix[others[:, None], others], sigma_limits(rest))
         )
 
+    @property
+    def of_cameras(self) -> Information:
+        """The information on cameras and stations, with all else integrated out."""
+        return self.marginal([key for key in self.keys if key.kind in ("camera", "station")])
+
     def without(self, keys: Collection[Key]) -> Information:
         """The information without some numbers, which are integrated out."""
         gone = set(keys)
