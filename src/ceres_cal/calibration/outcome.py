@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, first_of, inverted, replace, two_digits
+from ceres_cal.base import Array, DegenerateError, Indices, Mask, bounds_text, first_of, inverted, replace, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejection
 from ceres_cal.effects.aside import Explanation
@@ -248,7 +248,7 @@ def came_out(
         end.estimate,
         observations.targets,
         _fit(end, problem.layout),
-        _rejected(observations, out, far, explanations),
+        _rejected(observations, out, far, explanations, end.by_chance),
         end.solution.termination,
         end.solution.converged,
         end.rounds,
@@ -322,7 +322,11 @@ def _rms(values: Array) -> float:
 
 
 def _rejected(
-    observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
+    observations: Observations,
+    rows: Sequence[Indices],
+    sigmas: Sequence[Array],
+    explanations: Sequence[Explanation],
+    by_chance: Mask | None = None,
 ) -> tuple[Rejection, ...]:
     """Return the rows of points and curve observations that did not take part, with how far off they are or why."""
     groups = [one for one in explanations if one.is_taken]
@@ -333,6 +337,8 @@ def _rejected(
     ):
         for row, sigma in zip(out.tolist(), far.tolist(), strict=True):
             reason = f"{sigma:.1f} sigma off" if np.isfinite(sigma) else "cannot be seen from there"
+            if by_chance is not None and by_chance[first + row]:
+                reason += " by chance, as most around it are outliers"
             reason = next((one.words for one in groups if one.rows[first + row]), reason)
             if copy_of[row] >= 0:
                 reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"

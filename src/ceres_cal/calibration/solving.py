@@ -45,7 +45,7 @@ from ceres_cal.robust.as_built import (
     tolerances_of,
 )
 from ceres_cal.robust.competing import Solver, Subproblem, compete
-from ceres_cal.robust.other_minima import least_of_few, lost_rows, seen_alike
+from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.stated import Conflicts, statements
 from ceres_cal.robust.unsteady import ViewDisplacement, find_unsteady
@@ -118,13 +118,12 @@ class TaskSolution(Frozen):
 
     @property
     def outlier_masks(self) -> tuple[Mask, Mask]:
-        """See `Calibration.outlier_masks`, without lost boards: these agree with any lens by chance."""
-        inliers = self.end.inliers
-        if inliers.rows.all():
+        """See `Calibration.outlier_masks`, without those that agree with any lens by chance."""
+        inliers, by_chance = self.end.inliers, self.end.by_chance
+        if by_chance is None or inliers.rows.all():
             return ~inliers.points, ~inliers.curves
         points, curves = self.came_out.outlier_masks(self.problem.observations)
-        lost = lost_rows(self.problem, inliers)
-        return points & ~lost[: len(points)], curves & ~lost[len(points) :]
+        return points & ~by_chance[: len(points)], curves & ~by_chance[len(points) :]
 
     @property
     def scales(self) -> tuple[float, float]:

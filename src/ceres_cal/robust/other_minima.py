@@ -14,7 +14,7 @@ which minimum is the least nor that there are two.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem import Estimate, Information, Problem, Solution, Weighting, placement_costs, solve
 from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.problem.residuals import residuals_alone
-from ceres_cal.robust.noise import Inliers
+from ceres_cal.robust.noise import InlierFit, Inliers, deleted_lengths
 from ceres_cal.scene import TURNED, Camera, Target, is_seen_turned
 from ceres_cal.start import consensus_homography, pose_from_homography
 
@@ -161,6 +161,35 @@ def lost_rows(problem: Problem, inliers: Inliers) -> Mask:
     lost = np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < LOST)
     own = sights.take(np.array([i for i in lost if sights.keys[i].placement in problem.layout.placements], np.int64))
     rows[own.point_rows] = rows[len(inliers.points) + own.curve_rows] = True
+    return rows
+
+
+def rows_among_outliers(inliers: Inliers, problem: Problem, fit: Callable[[], InlierFit]) -> Mask:
+    """(N + M,) observations most of whose neighbours in the picture are outliers, and whose own residual says nothing,
+    because the estimate follows them more than all others together (leverage above 1/2).
+
+    A few of many outliers agree with some lens by chance. At the rim of the picture, where nothing else is left, that
+    lens is the estimate.
+    """
+    observations, neighbours = problem.observations, 8
+    rows, is_seen = np.zeros_like(inliers.rows), np.isfinite(inliers.sigmas)
+    views = np.concatenate([observations.points.view, observations.curves.view])
+    is_outlier = is_seen & ~inliers.rows
+    judged = is_seen & (np.bincount(views[is_outlier], minlength=len(observations.views)) > neighbours // 2)[views]
+    if not judged.any():
+        return rows
+    fitted = fit()
+    observation, length = deleted_lengths(judged, inliers.weighting(problem.options), fitted)
+    squared, own = length**2, inliers.sigmas[observation] ** 2
+    is_followed = np.where(fitted.used[observation], squared > 2.0 * own, 2.0 * squared < own)
+    pixels = np.concatenate([observations.points.pixels, observations.curves.pixels])
+    for row in observation[is_followed]:
+        near = np.flatnonzero(judged & (views == views[row]))
+        near = near[near != row]
+        if len(near) > neighbours:
+            distances = np.sum((pixels[near] - pixels[row]) ** 2, axis=1)
+            near = near[np.argpartition(distances, neighbours)[:neighbours]]
+            rows[row] = 2 * np.count_nonzero(is_outlier[near]) > neighbours
     return rows
 
 

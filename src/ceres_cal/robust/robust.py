@@ -28,7 +28,12 @@ from ceres_cal.robust.noise import (
     median_scales,
     visible_from,
 )
-from ceres_cal.robust.other_minima import lost_rows, with_lost_boards_posed, without_mirrored_poses
+from ceres_cal.robust.other_minima import (
+    lost_rows,
+    rows_among_outliers,
+    with_lost_boards_posed,
+    without_mirrored_poses,
+)
 
 MOST_ROUNDS = 15
 # Relative changes of a noise scale that count as no change. Halving or doubling the first moves the answer by less than
@@ -47,6 +52,7 @@ class RobustSolution(Frozen):
         rounds: the number of solves so far.
         reduced: the information of observations and priors at the estimate, once nothing changes; None before, and
             where the rounds ran out.
+        by_chance: (N + M,) observations that take no part because they agree with any lens by chance.
     """
 
     problem: Problem
@@ -55,6 +61,7 @@ class RobustSolution(Frozen):
     residuals: Residuals
     rounds: int
     reduced: ReducedInformation | None = None
+    by_chance: Mask | None = None
 
     @property
     def estimate(self) -> Estimate:
@@ -105,8 +112,8 @@ class Rounds(ABC, Generic[_Round]):
         """The state with poses changed that a solve cannot leave by itself, their number, and the undecided sights."""
         return state, 0, undecided
 
-    def without_lost(self, state: _Round) -> _Round:
-        """The state without observations that agree with the pose of a lost board by chance; itself where none do."""
+    def without_agreeing_by_chance(self, state: _Round) -> _Round:
+        """The state without observations that agree with any lens by chance; itself where none do."""
         return state
 
     def refined(self, state: _Round) -> _Round:
@@ -124,13 +131,13 @@ class Rounds(ABC, Generic[_Round]):
                 undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
             if at_rest or before is None:
                 if rested is not None and state.judged_like(rested, self.no_change):
-                    state = self.without_lost(state)  # what was mended there came back
+                    state = self.without_agreeing_by_chance(state)  # what was mended there came back
                 rested = state if at_rest else None
                 state, changed, undecided = self.mended(state, undecided)
                 if before is None and not is_near:
                     state = self.refined(state)
                 if at_rest and not changed:
-                    as_is, state = state, self.without_lost(state)
+                    as_is, state = state, self.without_agreeing_by_chance(state)
                     state = self.with_leverages(state) if state is as_is else state
                     if state.reduced is not None:
                         break
@@ -191,7 +198,7 @@ class _RowRounds(Rounds[RobustSolution]):
         self._moving = 0.0
         self._scales = (1.0, 1.0)  # scales of points and of curves by which the last rough solve was weighted
         self._last: tuple[Inliers, Sights] | None = None
-        self._lost: Mask = np.zeros(problem.observations.rows, dtype=bool)  # observations of lost boards
+        self._by_chance: Mask = np.zeros(problem.observations.rows, dtype=bool)
         self.no_change = AT_REST if usual is None else AT_REST_AGAIN
         # Relative change of the cost at which the rough solves end, and at which all further ones do.
         self._rough_end, self._end = 1e-3, 1e-14
@@ -297,12 +304,16 @@ class _RowRounds(Rounds[RobustSolution]):
             state = self._judged(replace(state.solution, estimate=estimate), state.residuals, state.rounds)
         return state, lost + turned, undecided
 
-    def without_lost(self, state: RobustSolution) -> RobustSolution:
-        """Seven of 54 corners of one lost board of 16 moved phi by 3 standard deviations."""
-        lost = lost_rows(self._problem, self._judge(state.solution, state.residuals))
-        if np.array_equal(lost, self._lost):
+    def without_agreeing_by_chance(self, state: RobustSolution) -> RobustSolution:
+        """Seven of 54 corners of one lost board of 16 moved phi by 3 standard deviations; one of 31 outliers in the
+        corner of a picture moved places there by 12.
+        """
+        inliers = self._judge(state.solution, state.residuals)
+        among_outliers = rows_among_outliers(inliers, self._problem, lambda: self._fit(state, state.information))
+        by_chance = lost_rows(self._problem, inliers) | among_outliers
+        if np.array_equal(by_chance, self._by_chance):
             return state
-        self._lost = lost
+        self._by_chance = by_chance
         return self._judged(state.solution, state.residuals, state.rounds)
 
     def with_leverages(self, state: RobustSolution) -> RobustSolution:
@@ -324,7 +335,7 @@ class _RowRounds(Rounds[RobustSolution]):
 
     def _anew(self, state: RobustSolution) -> tuple[Inliers, ReducedInformation]:
         """Noise and inliers by the leverages at the estimate, and the information that the leverages come from."""
-        reduced = information(state.problem, state.estimate)
+        reduced = state.information
         if any(camera.lens.roughness for camera in state.estimate.cameras.values()):
             from ceres_cal.effects.smoothness import with_smoothness
 
@@ -333,10 +344,11 @@ class _RowRounds(Rounds[RobustSolution]):
         points, curves = reduced.leverages
         taken = points + self._problem.taken_up, curves
         self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
-        inliers, rows = self._judge(state.solution, state.residuals), state.inliers.rows
-        estimate, there = state.estimate, state.residuals
-        fitted = InlierFit(self._problem, estimate, there, rows, reduced)
-        return self._without(by_deleted_residuals(inliers, fitted)), reduced
+        inliers = self._judge(state.solution, state.residuals)
+        return self._without(by_deleted_residuals(inliers, self._fit(state, reduced))), reduced
+
+    def _fit(self, state: RobustSolution, reduced: ReducedInformation) -> InlierFit:
+        return InlierFit(self._problem, state.estimate, state.residuals, state.inliers.rows, reduced)
 
     def _judged(
         self, solution: Solution, before: Residuals, rounds: int, inliers: Inliers | None = None
@@ -349,8 +361,8 @@ class _RowRounds(Rounds[RobustSolution]):
         return self._with(anew, solution, there, rounds)
 
     def _without(self, inliers: Inliers) -> Inliers:
-        """The inliers without those of lost boards."""
-        return inliers.with_rows(inliers.rows & ~self._lost) if np.any(self._lost) else inliers
+        """The inliers without those that agree by chance."""
+        return inliers.with_rows(inliers.rows & ~self._by_chance) if np.any(self._by_chance) else inliers
 
     def _judge(self, solution: Solution, there: Residuals) -> Inliers:
         problem = self._problem
@@ -366,7 +378,7 @@ class _RowRounds(Rounds[RobustSolution]):
             self._last = last = inliers, self._problem.sights.used(inliers.points, inliers.curves)
         weighting = inliers.weighting(self._problem.options)
         problem = replace(self._problem, sights=last[1], weighting=weighting, feet=there.feet)
-        return RobustSolution(problem, solution, inliers, there, rounds)
+        return RobustSolution(problem, solution, inliers, there, rounds, by_chance=self._by_chance)
 
 
 def _much_below(scales: tuple[float, float], before: tuple[float, float]) -> bool:
