@@ -9,7 +9,18 @@ import pytest
 from scenery import overhead_pose
 
 import ceres_cal
-from ceres_cal import Camera, InputError, Observations, Pose, View, calibrate, checkerboard, custom, ssl_field
+from ceres_cal import (
+    Camera,
+    InputError,
+    Observations,
+    Pose,
+    View,
+    calibrate,
+    checkerboard,
+    custom,
+    join,
+    ssl_field,
+)
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.images import image_files
 from ceres_cal.scene.lens import Brown
@@ -144,3 +155,40 @@ def test_what_is_public() -> None:
     ):
         assert getattr(ceres_cal, name).__module__.startswith("ceres_cal.")
     assert len(ceres_cal.ssl_field("B").points) == len(ssl_field("B").points)
+
+
+def test_masked_pixels_are_not_seen() -> None:
+    """The mask was ignored: what lay under it took part."""
+    pixels = np.ma.array([[1.0, 2.0], [3.0, 4.0]], mask=[[True, False], [False, False]])
+    seen = Observations.from_points(pixels, custom({"a": (0.0, 0.0, 0.0), "b": (1.0, 0.0, 0.0)}), (640, 480))
+    assert seen.points.pixels.tolist() == [[3.0, 4.0]]
+
+
+def test_places_that_move_and_were_not_said_to_are_named() -> None:
+    """It was "check labels, target dimensions and the lens"."""
+    places = np.array([[c * 0.1, r * 0.1, 0.0] for r in range(6) for c in range(9)])
+    poses = [overhead_pose(0.4, 0.25, 1.6, 5 * n, 4 - 4 * n, 40 * n) for n in range(3)]
+    views = {f"f{number}": TRUE.at(pose).project(places) for number, pose in enumerate(poses)}
+    seen = Observations.from_points(views, places, (1280, 960))
+    with pytest.raises(InputError, match=r"'camera', frame 'f.': half of what it shows of 'target' .* give moves=True"):
+        calibrate(seen)
+    assert calibrate(Observations.from_points(views, places, (1280, 960), moves=True)).station().phi > 0.0
+
+
+def test_frames_that_a_fixed_camera_cannot_have_seen_are_named() -> None:
+    """Two cameras whose names are exchanged in one of two frames. It took up to 108 s, and was not named."""
+    field, along = ssl_field("B"), np.linspace(-4.0, 4.0, 60)
+    lines = {
+        name: np.column_stack([along, 0.0 * along + y]) for name, y in (("TopTouchLine", 3.0), ("CenterLine", 0.0))
+    }
+    lines["HalfwayLine"] = lines["CenterLine"][:, ::-1]
+    seen = list[dict[str, np.ndarray[Any, Any]]]()
+    for x, y in ((-2.0, 1.4), (2.0, 1.2)):
+        camera = TRUE.at(overhead_pose(x, y, 4.0, 3.0, 2.0))
+        every = {name: camera.project(np.column_stack([places, 0.0 * along])) for name, places in lines.items()}
+        seen.append({name: p[np.all((p > 0) & (p < (1279, 959)), axis=1)] for name, p in every.items()})
+    each = (("a", "0", 0), ("b", "0", 1), ("a", "1", 1), ("b", "1", 0))
+    views = [Observations.from_curves(seen[of], field, (1280, 960), camera=name, frame=f) for name, f, of in each]
+    with pytest.raises(InputError, match=r"station 'a', frame '1': half of what it shows of .* correct the names"):
+        calibrate(join(*views))
+    assert all(len(one) > 9 for own in seen for one in own.values())

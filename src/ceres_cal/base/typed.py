@@ -159,9 +159,12 @@ def _named(kind: type) -> str:
 
 
 def numbers_in(values: Any, name: str) -> Array:
-    """Return an array of numbers; InputError naming the argument for anything else."""
+    """Return an array of real numbers, NaN where masked; InputError naming the argument for anything else."""
     try:
-        return np.asarray(values, dtype=float)
+        if np.iscomplexobj(values):
+            raise TypeError("complex")
+        given, mask = np.asarray(values, dtype=float), getattr(values, "mask", None)  # without importing `numpy.ma`
+        return np.where(mask, np.nan, given) if isinstance(mask, np.ndarray) else given
     except (TypeError, ValueError):
         raise InputError(f"{name} must be numbers, not {type(values).__name__} {values!r:.{_MOST_LETTERS}}") from None
 

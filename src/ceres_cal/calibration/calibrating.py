@@ -34,7 +34,7 @@ from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.robust.usable import NO_FIT
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.start.listed import require_as_listed
+from ceres_cal.start.listed import require_as_listed, require_at_rest
 
 if TYPE_CHECKING:
     from ceres_cal.calibration.lenses import LensDecisions
@@ -70,13 +70,14 @@ def calibrate(
         SolutionError: the solution is no usable camera.
         InputError: a prior or a fixed number does not exist in the camera's lens; pixels lie outside their image, or in
             one corner of a far larger image; a picture is mirrored; points are listed in another order than their
-            target's.
+            target's, or a target moves that may not.
     """
     options = options or Options()
     require_possible_numbers(observations, options)
     require_filled(observations)
     if not is_bulk(observations):
         require_as_listed(observations)
+        require_at_rest(observations, NO_FIT)
     observations, options = free_dimensions(observations, options)
     with for_small_matrices(), at_most(options.threads):
         try:

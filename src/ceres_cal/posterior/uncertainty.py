@@ -23,6 +23,7 @@ from ceres_cal.base import (
     eigh,
     html_of,
     median,
+    numbers_in,
     rows,
     text_of,
 )
@@ -271,13 +272,14 @@ class Uncertainty(Frozen):
         return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
     def located(self, pixels: ArrayLike, height_m: float = 0.0, station: str | None = None) -> PointSpread:
-        """Locate pixels (N, 2) at a height, with 95 % bounds.
+        """Locate pixels (N, 2), or one (2,), at a height, with 95 % bounds.
 
         Raises:
             InputError: see `map_sd_mm`.
         """
         name = self.estimate.station_name(station)
-        return spread_of_points(self.estimate, self.posterior, name, rows(pixels, 2, "pixels"), height_m)
+        given = rows(np.atleast_2d(numbers_in(pixels, "pixels")), 2, "pixels")
+        return spread_of_points(self.estimate, self.posterior, name, given, height_m)
 
     def map_sd_mm(
         self,

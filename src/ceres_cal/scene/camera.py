@@ -193,7 +193,7 @@ class Camera(Frozen, eq=True):
         Raises:
             InputError: a height far above the camera, which is probably in millimetres: heights are in metres.
         """
-        if not isinstance(height_m, Real) or abs(height_m) == np.inf:
+        if not isinstance(height_m, Real) or not np.isfinite(height_m):
             raise InputError(f"height_m must be a number of metres, such as 0.15, not {height_m!r}")
         far_m = 10.0  # a height above this, and far above the camera, is in millimetres
         if abs(height_m) > max(far_m, 2.0 * abs(self.position[2])):
@@ -236,9 +236,15 @@ class Camera(Frozen, eq=True):
 
         Args:
             matrix: K (3, 3) of the straight image, by default the camera's own. size: its (width, height), likewise.
+
+        Raises:
+            InputError: the matrix or the size is none.
         """
-        inverse = np.linalg.inv(self.matrix if matrix is None else numbers_in(matrix, "matrix"))
-        width, height = size_in(size or self.image_size, "size")
+        given = self.matrix if matrix is None else numbers_in(matrix, "matrix")
+        if given.shape != (3, 3) or not abs(np.linalg.det(given)) > 0.0:
+            raise InputError(f"matrix must be K (3, 3) of a camera, which has an inverse, not {matrix!r:.80}")
+        inverse = np.linalg.inv(given)
+        width, height = size_in(self.image_size if size is None else size, "size")
         pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))], axis=-1)
         places = self.at(Pose.identity()).project(pixels.reshape(-1, 3) @ inverse.T).reshape(height, width, 2)
         return places[..., 0].astype(np.float32), places[..., 1].astype(np.float32)

@@ -1,5 +1,5 @@
-"""Detect points of flat targets that are listed in another order than the target's: column by column, from the last to
-the first, there and back.
+"""Detect points of flat targets that are listed in another order than the target's (column by column, from the last to
+the first, there and back), and targets that move although they are said not to.
 
 The picture of a plane is nearly a homography, for any lens. Points under each other's names do not fit a homography,
 but do again if they are read in the order in which they were listed. Orders that look like the target turned or
@@ -10,12 +10,12 @@ and a target that is seen from its other side is reported after the solve (`cali
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, InputError, Mask, evenly, first_of, log_binomial_tail, median
-from ceres_cal.observations import Observations, bounds_of, ranges
+from ceres_cal.base import Array, Indices, Indices32, InputError, Mask, evenly, first_of, log_binomial_tail, median
+from ceres_cal.observations import Columns, Observations, bounds_of, ranges
 from ceres_cal.start.closed_forms import PlaneData, RadialProfile, homographies_of_sights
 
 _FEW = 16  # points of a view used to decide whether its order is examined
@@ -43,6 +43,51 @@ def require_as_listed(observations: Observations) -> None:
                 f"target {name!r}: its points are listed {', '.join(orders)}: list them in the target's own order, or "
                 "correct its numbers of columns and rows"
             )
+
+
+def require_at_rest(observations: Observations, most: float) -> None:
+    """Raise InputError if a fixed target moves from frame to frame in the picture of a camera that does not move, too.
+
+    Args:
+        most: share of the image's diagonal by which half of its features may be elsewhere in the next frame.
+    """
+    shown, enough = dict[tuple[str, str], list[int]](), 100  # views of a target that are compared with the next
+    for number, view in enumerate(observations.views):
+        if view.placement is None:
+            shown.setdefault((view.target, view.station), []).append(number)
+    for (target, station), numbers in shown.items():
+        some = [numbers[at] for at in evenly(len(numbers), enough)]
+        pairs = {pair: np.array([*_apart(observations, *pair)]) for pair in pairwise(some)}
+        apart = np.concatenate([np.empty(0), *pairs.values()])
+        limit_px = most * float(np.hypot(*observations.cameras[observations.views[some[0]].camera]))
+        if len(apart) and median(apart) > limit_px:
+            now, then = max((pair for pair, own in pairs.items() if len(own)), key=lambda pair: median(pairs[pair]))
+            frame, before = observations.views[then].frame, observations.views[now].frame
+            raise InputError(
+                f"station {station!r}, frame {frame!r}: half of what it shows of {target!r} is {median(apart):.0f} px "
+                f"or more from its place in frame {before!r}, but neither may move: if the target was moved, give "
+                'moves=True (in a file "movable": true); if the camera was, give each frame a station of its own; or '
+                "correct the names"
+            )
+
+
+def _apart(observations: Observations, first: int, second: int) -> Iterator[float]:
+    """Distances between the places of one feature in two views, px; of a curve, of which each may show another part,
+    between the nearest observations.
+    """
+    least, most = 10, 50  # observations of a curve: fewer are clicks in places of their own; more change nothing
+    for columns, is_point in ((observations.points, True), (observations.curves, False)):
+        features, pixels = zip(*(_of_view(columns, number) for number in (first, second)), strict=True)
+        for feature in sorted(set(features[0].tolist()) & set(features[1].tolist())):
+            one, other = (seen[own == feature] for own, seen in zip(features, pixels, strict=True))
+            if is_point or min(len(one), len(other)) >= least:
+                one, other = (seen[evenly(len(seen), most)] for seen in (one, other))
+                yield float(np.linalg.norm(one[:, None] - other, axis=2).min())
+
+
+def _of_view(columns: Columns, number: int) -> tuple[Indices32, Array]:
+    rows = slice(*np.searchsorted(columns.view, (number, number + 1)))
+    return columns.feature[rows], columns.pixels[rows]
 
 
 def _in_another_order(observations: Observations, numbers: Indices, places: Array) -> Iterator[tuple[int, str]]:
