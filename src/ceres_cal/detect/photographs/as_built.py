@@ -118,7 +118,7 @@ def _change(factor: float) -> str:
 def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, ...]) -> FieldAsBuilt:
     """Estimate from the lines that were found how the target is painted; as drawn where they do not determine it.
 
-    All of the camera but its aspect is free.
+    All of the camera but its aspect and skew is free.
 
     Args:
         priors: on the camera's intrinsics.
@@ -129,7 +129,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     rows = lines.found
     sigma = np.sqrt(together) * np.maximum(lines.sigma_px[rows], least_sigma_px)
     seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
-    free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
+    free = tuple(name for name in intrinsic_names(camera.lens) if name not in ("aspect", "skew"))
     problem, estimate = problem_of(camera, seen, free, priors)
     left = residuals(problem.sights, estimate)
     # reads: "..." of `FieldAsBuilt.words`: this is another field

@@ -413,5 +413,8 @@ class Tracker:
 
 
 def _free(camera: Camera) -> tuple[str, ...]:
-    """Names of the intrinsics that a photograph may change; pixels that are square so far remain square."""
-    return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect" or camera.aspect != 1.0)
+    """Names of the intrinsics that a photograph may change; pixels that are square so far remain square, and a skew as
+    it is.
+    """
+    held = {"skew"} if camera.aspect != 1.0 else {"skew", "aspect"}
+    return tuple(name for name in intrinsic_names(camera.lens) if name not in held)
