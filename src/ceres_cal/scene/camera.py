@@ -145,7 +145,12 @@ class Camera(Frozen, eq=True):
     @property
     def folds(self) -> bool:
         """Whether the lens stops being monotone inside the image, so that some pixels have no unique ray."""
-        return not np.all(self.lens.shows(self._edge, self.phi))
+        return self.folded_edge > 0.0
+
+    @property
+    def folded_edge(self) -> float:
+        """Share of the image's edge that is past the radius where the lens stops being monotone."""
+        return float(np.mean(~np.asarray(self.lens.shows(self._edge, self.phi))))
 
     def require_monotone(self, name: str) -> None:
         """Raise InputError naming the camera where its lens folds over inside the image."""

@@ -173,13 +173,12 @@ def best_fit(
     # Largest ratio of the noise with square pixels to that with free ones: 1.00 to 1.07 where a court was drawn a
     # millimetre off, 1.18 where a photograph of worn lines was stretched by 4 %, 7 where a clear one was by 7 %.
     nearly = 1.12
-    # Penalty factor on the noise of a lens that folds in the picture: a polynomial may do so beyond the last line, and
-    # bends what is predicted there. For a fisheye the other lenses leave a hundred times as much noise.
-    folded = 2.0
     fits = [] if is_stretched else _fits(squared_pixels(camera), observations, lengths)
     if camera.aspect != 1.0:
         fits += [(nearly * off, found, own) for off, found, own in _fits(camera, observations, lengths)]
-    order = sorted(fits, key=lambda fit: fit[0] * (folded if fit[1].station().folds else 1.0))
+    # A lens that folds in the picture counts as noisier, up to twice: a polynomial may do so beyond the last line, and
+    # bends what is predicted there. For a fisheye the other lenses leave a hundred times as much noise.
+    order = sorted(fits, key=lambda fit: fit[0] * (1.0 + fit[1].station().folded_edge))
     asked = (  # a phi that no lens has is in an open valley of the cost, where another place fits as well
         # quiet: the next one is taken
         one if is_lens(one.station()) else attempt(partial(calibrate_near, one.station(), observations, own))
