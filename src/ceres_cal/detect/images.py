@@ -44,13 +44,14 @@ def read_grey(path: str | Path) -> Image:
 
 
 def read_light(path: str | Path) -> Array32:
-    """Read an image as (height, width) grey levels in which all pixels of a colour sensor have equal weight: see
-    `light`.
+    """Read an image as (height, width) grey levels, 0 to 255 whatever its depth, in which all pixels of a colour sensor
+    have equal weight: see `light`.
 
     Raises:
         InputError: see `read_grey`.
     """
-    return light(read_colour(path))
+    picture = read_colour(path)
+    return light(picture) * np.float32(255.0 / np.iinfo(picture.dtype).max)
 
 
 def light(image: Image) -> Array32:

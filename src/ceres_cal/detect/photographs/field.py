@@ -240,7 +240,7 @@ def _together(paths: Sequence[Path], looked_for: Callable[[Path, Array32], Searc
     """
     one = merged((str(path), read_colour(path)) for path in paths[:: -(-len(paths) // MOST_PICTURES)])
     name = f"{one.used[0]} and {len(one.used) - 1} more, combined"
-    result = looked_for(Path(name), one.picture)
+    result = looked_for(Path(name), one.picture * np.float32(255.0 / one.white))
     if result.followed is None:
         raise InputError(result.reason)
     return {name: result, **{path: SearchResult(None, reason) for path, reason in one.left_out}}
