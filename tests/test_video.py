@@ -76,6 +76,14 @@ def test_a_camera_that_was_bumped_half_way_and_one_that_is_carried() -> None:
     assert merged([("alone", shot(1))]).used == ("alone",)
 
 
+def test_pictures_of_a_camera_that_shakes_are_moved_back() -> None:
+    shifts = np.linspace(-0.6, 0.6, 8)
+    one = merged((str(n), shot(n, shift)) for n, shift in enumerate(shifts))
+    assert len(one.used) == 8 and one.shaken_px == pytest.approx(np.std(shifts), rel=0.2)
+    off = np.abs(one.picture - floor(float(np.mean(shifts))))
+    assert np.mean(off) < 1.5 and np.max(off) < 30.0  # 1.1 and 19; with two pictures of the eight 7.1 and 110
+
+
 def test_pictures_that_do_not_go_together(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="b: 100 x 100 px of uint8, but a has 320 x 240 px of uint8"):
         merged([("a", shot(1)), ("b", shot(2)[:100, :100])])
@@ -140,6 +148,7 @@ def test_a_field_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         "picture": picture,
         "used": [f"frame {number} of game.avi" for number in range(4)],
         "left_out": [{"image": "frame 4 of game.avi", "reason": "the camera had moved"}],
+        "shaken_px": 0.0,
     }
     (found,) = data["found"]
     assert found["image"] == picture and found["found"] > 0.9 * found["places"]  # 0.91: it has robots of its own

@@ -125,7 +125,8 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
     levels = np.round(found.picture * (65535 // found.white)).astype(np.uint16)
     save(path, detect.encoded(np.asarray(levels), ".png", 100))
     left_out = [{"image": name, "reason": reason} for name, reason in found.left_out]
-    return {"picture": str(path), "used": list(found.used), "left_out": left_out}
+    shaken_px = round(found.shaken_px, 1)
+    return {"picture": str(path), "used": list(found.used), "left_out": left_out, "shaken_px": shaken_px}
 
 
 def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, base.Image]]:
@@ -138,12 +139,16 @@ def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) 
 
 
 def median_text(data: dict[str, Any]) -> str:
-    """Summarise in one line which pictures were used."""
+    """Summarise in one line which pictures were used, and whether the camera shook."""
     used, left_out = len(data["used"]), data["left_out"]
     reasons: dict[str, list[str]] = {}
     for one in left_out:
         reasons.setdefault(one["reason"], []).append(one["image"])
     said = [f"{len(names)} left out, {reason} ({first_of(names)})" for reason, names in reasons.items()]
+    if shaken_px := data["shaken_px"]:
+        said.append(
+            f"the others were moved back by {shaken_px} px: the camera shakes, so each picture is off by as much"
+        )
     return "; ".join([f"{data['picture']}: the median of {plural(used, 'picture')} of {used + len(left_out)}", *said])
 
 

@@ -181,7 +181,7 @@ def _step(
     answer = COMMANDS[name].answer(arguments, quiet=args.quiet or args.json)
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
     merged = answer.data.get("median", {})
-    left_out = [median_text(merged)] if merged.get("left_out") else []
+    left_out = [median_text(merged)] if merged.get("left_out") or merged.get("shaken_px") else []
     warned = [] if most is None else answer.text({"warning"}).splitlines()
     lines = [*answer.text(titles).splitlines()[:most], *left_out, *missed, *warned]
     return _Step(typed, lines, answer.data, answer.exit_code)

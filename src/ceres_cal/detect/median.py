@@ -2,7 +2,8 @@
 
 A picture that is blurred, or that was taken after the camera was moved, is left out. Its displacement from a reference
 is estimated from image gradients (Lucas and Kanade, IJCAI 1981), in one robust linear fit with an affine motion, a gain
-and an offset.
+and an offset. A camera that shakes displaces each picture a little: these are moved back, since the median of displaced
+lines is displaced differently for each direction of line.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
-from ceres_cal.base import Array, Array32, Frozen, Image, InputError, most_bytes
+from ceres_cal.base import Array, Array32, Frozen, Image, InputError, most_bytes, rms
 from ceres_cal.detect.images import light
 
 MOST_PICTURES = 25
 """Number of pictures that one is made from, taken evenly from video frames and photographs."""
-# Largest displacement of a picture that is used, px.
-_MOVED_PX = 0.2
+# Largest displacement, px, of a picture that is used, of a camera that stands still, and of one that shakes.
+_MOVED_PX = 0.2, 1.0
 # Share of the usual sharpness below which a picture is blurred. Noise is smoothed away before.
 _BLURRED = 0.5
 _BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # blocks to a side; pixels used of each; fewest pixels of a block that counts
@@ -37,12 +38,14 @@ class MedianPicture(Frozen):
         picture: (height, width) grey levels, 0 to `white`.
         used: names of the pictures that took part.
         left_out: name and reason of the others.
+        shaken_px: root mean square displacement of those that took part, which were moved back.
     """
 
     picture: Array32
     white: int
     used: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
+    shaken_px: float
 
 
 def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
@@ -73,23 +76,46 @@ def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
         )
     left_out |= {n: "the camera had moved" for n in sharp if n not in chosen}
     return MedianPicture(
-        _middle([greys[n] for n in chosen]),
+        _middle([picture for picture, _ in chosen.values()]),
         int(np.iinfo(greys[0].dtype).max),
         tuple(names[n] for n in chosen),
         tuple((names[n], left_out[n]) for n in sorted(left_out)),
+        rms(np.array([px for _, px in chosen.values()])),
     )
 
 
-def _agreeing(greys: Sequence[Image], every: Sequence[int], some: Sequence[int]) -> list[int]:
-    """Return the pictures that are not displaced from the median of those of `some` that agree with each other."""
-    kept = list(some)
+def _agreeing(greys: Sequence[Image], every: Sequence[int], some: Sequence[int]) -> dict[int, tuple[Image, float]]:
+    """Return by number the pictures that are not displaced from the median of those of `some` that agree with each
+    other by more than a shaking camera displaces them: moved back to where it was on average, and by how many px.
+    """
+    at_rest_px, usually = 0.02, 4.0  # largest displacement by shaking, in units of the median one
+    kept, back, moves = list(some), dict(enumerate(greys)), dict[int, Array]()
     for _ in range(_ROUNDS):
-        reference = _Reference.of(_middle([greys[n] for n in kept]))
-        same = [n for n in every if reference.moved_px(greys[n]) < _MOVED_PX]
-        if same == kept or not same:
+        reference = _Reference.of(_middle([back[n] for n in kept]))
+        further = {n: reference.motion(back[n]) for n in every}
+        moves = {n: moves.get(n, 0.0) + further[n] for n in every}
+        away = {n: _size_px(moves[n]) for n in every}
+        most_px = np.clip(usually * np.median(list(away.values())), *_MOVED_PX)
+        same = [n for n in every if away[n] < most_px]
+        if not same or (same == kept and max(_size_px(further[n]) for n in same) < at_rest_px):
             break
-        kept = same
-    return same
+        kept, middle = same, np.mean([moves[n] for n in same], axis=0)
+        moves = {n: moves[n] - middle for n in same}
+        back = dict(enumerate(greys)) | {n: _moved_back(greys[n], moves[n]) for n in same}
+    return {n: (back[n], away[n]) for n in same}
+
+
+def _size_px(motion: Array) -> float:
+    """Root mean square displacement by a motion (6,)."""
+    return float(np.sqrt(motion[:2] @ motion[:2] + motion[2:] @ motion[2:] / 3.0))
+
+
+def _moved_back(grey: Image, motion: Array) -> Image:
+    """Return a picture without its motion (6,)."""
+    size, turn = grey.shape[::-1], motion[2:].reshape(2, 2)
+    back = np.column_stack([np.eye(2) - 2.0 * turn / size, turn.sum(axis=1) - motion[:2]])
+    how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(grey, back, size, flags=how, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _read(pictures: Iterable[tuple[str, Image]]) -> tuple[list[str], list[Image]]:
@@ -150,12 +176,12 @@ class _Reference(Frozen):
         columns = np.column_stack([gx, gy, gx * x, gx * y, gy * x, gy * y, level, np.ones(len(chosen))])
         return cls(chosen, block[chosen], level, columns)
 
-    def moved_px(self, grey: Image) -> float:
-        """Root mean square displacement of another picture, px; infinity where it shows something else."""
+    def motion(self, grey: Image) -> Array:
+        """(6,) px by which another picture is displaced, as in `columns`; infinity where it shows something else."""
         seen = _smooth(grey).ravel()[self.pixels].astype(float)
         alike = self._alike(seen)
         if 2 * sum(alike.values()) <= len(alike):
-            return np.inf
+            return np.full(6, np.inf)
         rows = np.isin(self.block, [block for block, same in alike.items() if same])
         columns, seen, weight = self.columns[rows], seen[rows], np.ones(np.count_nonzero(rows))
         for _ in range(_ROUNDS):
@@ -163,17 +189,23 @@ class _Reference(Frozen):
             fit = np.linalg.lstsq(wide.T @ wide, wide.T @ (seen * weight), rcond=None)[0]
             left = np.abs(seen - columns @ fit)
             weight = np.minimum(1.0, _BEND * 1.4826 * max(float(np.median(left)), 1e-3) / np.maximum(left, 1e-12))
-        moves = fit[:6] / max(abs(float(fit[6])), 1e-3)
-        return float(np.sqrt(moves[:2] @ moves[:2] + moves[2:] @ moves[2:] / 3.0))
+        return np.asarray(fit[:6] / max(abs(float(fit[6])), 1e-3))
 
     def _alike(self, seen: Array) -> dict[int, bool]:
         """Whether each block of the picture that shows anything shows the same as the reference."""
         alike = 0.6  # least correlation of a block that shows the same; most blocks must, as people hide some
+        shift = self.columns[:, (0, 1, -2, -1)]  # the picture may be displaced
+        blocks = {int(number): self.block == number for number in np.unique(self.block)}
         return {
-            int(number): bool(np.corrcoef(self.grey[own], seen[own])[0, 1] > alike)
-            for number, own in ((number, self.block == number) for number in np.unique(self.block))
+            number: bool(np.corrcoef(_fitted(shift[own], seen[own]), seen[own])[0, 1] > alike)
+            for number, own in blocks.items()
             if np.count_nonzero(own) >= _FEWEST and np.ptp(seen[own]) > 0.0
         }
+
+
+def _fitted(columns: Array, values: Array) -> Array:
+    """(N,) values as columns (N, K) explain them."""
+    return np.asarray(columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
 def _middle(greys: Sequence[Image]) -> Array32:
