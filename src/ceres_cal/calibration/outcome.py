@@ -244,11 +244,12 @@ def came_out(
     observations = problem.observations
     out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
     far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
+    by_chance = None if end.by_chance is None else end.by_chance & (end.inliers.sigmas <= end.inliers.bound)
     return Calibration(
         end.estimate,
         observations.targets,
         _fit(end, problem.layout),
-        _rejected(observations, out, far, explanations, end.by_chance),
+        _rejected(observations, out, far, explanations, by_chance),
         end.solution.termination,
         end.solution.converged,
         end.rounds,

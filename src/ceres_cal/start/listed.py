@@ -61,11 +61,11 @@ def require_at_rest(observations: Observations, most: float) -> None:
         apart = np.concatenate([np.empty(0), *pairs.values()])
         limit_px = most * float(np.hypot(*observations.cameras[observations.views[some[0]].camera]))
         if len(apart) and median(apart) > limit_px:
-            now, then = max((pair for pair, own in pairs.items() if len(own)), key=lambda pair: median(pairs[pair]))
+            farthest_px, now, then = max((median(own), *pair) for pair, own in pairs.items() if len(own))
             frame, before = observations.views[then].frame, observations.views[now].frame
             raise InputError(
-                f"station {station!r}, frame {frame!r}: half of what it shows of {target!r} is {median(apart):.0f} px "
-                f"or more from its place in frame {before!r}, but neither may move: if the target was moved, give "
+                f"station {station!r}, frame {frame!r}: half of what it shows of {target!r} is {farthest_px:.0f} px or "
+                f"more from its place in frame {before!r}, but neither may move: if the target was moved, give "
                 'moves=True (in a file "movable": true); if the camera was, give each frame a station of its own; or '
                 "correct the names"
             )
