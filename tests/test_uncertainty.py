@@ -230,6 +230,16 @@ def test_another_lens_is_followed_over_the_floor() -> None:
         assert np.linalg.norm(slopes @ shift - off) < left * np.linalg.norm(off)
 
 
+def test_a_length_is_as_uncertain_as_lenses_disagree_about_it() -> None:
+    """Lengths solved for with another lens are part of that component, though no pixel's place depends on them."""
+    found = calibrate(observed(25.0), Options(lens="radial", dimensions=("field/field_length_m",)))
+    near, known = found.estimate, found.uncertainty.posterior
+    key = near.structure.keys[0]
+    other = replace(near, structure=near.structure.with_values(near.structure.values + 0.04))
+    before, after = (one.sd_of(*key[:3]) for one in (known, with_other_lenses(known, near, others_of(near, other))))
+    assert after == pytest.approx(np.hypot(before, 0.8**0.5 * 0.04), rel=0.01)  # 0.8 is its probability
+
+
 def test_another_lens_is_followed_where_no_floor_is_seen() -> None:
     """With the rays alone, after the best rotation: another principal point is a rotation, except
     for the distortion.

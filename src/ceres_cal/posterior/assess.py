@@ -224,9 +224,10 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
     from ceres_cal.posterior.other_lenses import counted, shifts_to_lenses
 
     followed = posterior.followed_phi
-    # A lens says nothing about how targets are built or placed; it was compared with some observations, targets as
-    # drawn.
-    keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
+    # A lens was compared with some observations, targets as built: it says nothing about how they are built or placed,
+    # except about dimensions, which were free.
+    of_lens = ("camera", "station", "dimension")
+    keys = [key for key in posterior.keys if key.kind in of_lens and key not in followed]
     weights = counted(lenses.weights)
     every = (lenses.near, *lenses.others)
     shifts = shifts_to_lenses(lenses, keys, every[:1])[0]

@@ -19,7 +19,7 @@ rough the lens is. The free numbers are off by what they absorb of the bumps.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from ceres_cal.effects import Linearised, equation_weights, likeliest_sizes, lin
 from ceres_cal.effects.evidence import agreement as agreement_of
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
-from ceres_cal.problem import Estimate, Information, Key, ReducedInformation, natural_sizes
+from ceres_cal.problem import Estimate, Information, Key, difference, natural_sizes
 from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
@@ -59,7 +59,7 @@ class OtherLenses(Frozen):
     @cached_property
     def pixels(self) -> dict[str, Array]:
         """Camera -> (N, 2) pixels of a grid over its image, as far as it was observed."""
-        return {name: _places_of(self.near.cameras[name], reach_px) for name, reach_px in self.reach_px.items()}
+        return {name: _places_of(self.near.cameras[name], reach) for name, reach in self.reach_px.items()}
 
 
 class OpenDirection(NamedTuple):
@@ -155,7 +155,7 @@ def shown_slopes(there: Estimate, keys: Sequence[Key], lenses: OtherLenses) -> S
     return found
 
 
-def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate) -> OtherLenses:
+def together(each: Sequence[OtherLenses], floors: Set[str], end: Estimate) -> OtherLenses:
     """Combine other lenses of several cameras, each with its probabilities, into about as many combinations as there
     are lenses: for each camera the others and then the chosen one divide the interval from 0 to 1 by their
     probabilities, and lenses that share a part of the interval are a combination.
@@ -171,7 +171,9 @@ def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate)
     def combined(parts: Sequence[Estimate]) -> Estimate:
         cameras = {name: camera for one in parts for name, camera in one.cameras.items()}
         seen = {name: station for one in parts for name, station in one.stations.items() if name in floors}
-        return Estimate(cameras, {**end.stations, **seen}, {}, parts[0].structure)
+        own = [one.structure for one in parts if floors & {*one.stations}] or [parts[0].structure]
+        built = own[0].with_values(np.mean([one.values for one in own], axis=0))
+        return Estimate(cameras, {**end.stations, **seen}, {}, built)
 
     which = np.array([np.searchsorted(own, cuts[:-1], side="right") for own in bounds])
     nothing = Information.nothing()
@@ -203,7 +205,7 @@ def counted(weights: Sequence[float]) -> Array:
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[Estimate]) -> Array:
-    """(M, L, K) shifts of the numbers of M estimates that follow each of the other lenses by least squares.
+    """(M, L, K) shifts of the numbers of M estimates that follow each of the other lenses; each has its own dimensions.
 
     Args:
         nodes: with the chosen lens, at its minimum or elsewhere in a valley along phi.
@@ -222,6 +224,8 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[E
             off = other - near
             known = np.isfinite(slopes).all(axis=1) & np.isfinite(off)
             found[number, column] = np.linalg.lstsq(slopes[known] * sizes, off[known], rcond=followed)[0] * sizes
+    if own := [number for number, key in enumerate(keys) if key.kind == "dimension"]:
+        found[:, :, own] = [difference(other, lenses.near, [keys[i] for i in own]) for other in lenses.others]
     return found
 
 
@@ -320,8 +324,7 @@ class LensResiduals(Frozen):
     @property
     def in_rings(self) -> float:
         """Like `in_cells`, over rings about the principal point and for radial residuals; the largest of cameras."""
-        rings = 24  # from the middle to the farthest observation
-        agree = 0.0
+        rings, agree = 24, 0.0  # from the middle to the farthest observation
         for name, camera in self.cameras.items():
             own = np.repeat([key.camera == name for key in self.sights.keys], np.diff(self.sights.point_bounds))
             offsets = camera.offsets(self.sights.pixels[own])
@@ -363,9 +366,8 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
     """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, with cells of its own
     for each curve; at most so many along the image.
     """
-    names = sorted(sizes)
-    count = (len(sights.point_rows) + len(sights.curve_rows)) / (_IN_A_CELL * len(names))
-    side = min(most, max(2, int(np.sqrt(count))))
+    names, places = sorted(sizes), len(sights.point_rows) + len(sights.curve_rows)
+    side = min(most, max(2, int((places / (_IN_A_CELL * len(names))) ** 0.5)))
     owners = np.array([names.index(key.camera) for key in sights.keys])
     per_px = side / np.array([sizes[name] for name in names], dtype=float)
 
@@ -388,18 +390,16 @@ def shifts_by_roughness(end: RobustSolution, cameras: Iterable[str]) -> tuple[Se
     """Return numbers (K), and shifts (K,) of them; the sum of the shifts' outer products is the covariance that the
     roughness of some cameras' lenses adds.
     """
-    reduced = end.information
-    model = _linearised(end, reduced)
+    model = _linearised(end)
     shifts = [_shifts_of(model, name, end.estimate.cameras[name]) for name in cameras]
-    return reduced.shared.keys, [shift for own in shifts for shift in own]
+    return end.information.shared.keys, [shift for own in shifts for shift in own]
 
 
-def _linearised(end: RobustSolution, reduced: ReducedInformation) -> Linearised:
+def _linearised(end: RobustSolution) -> Linearised:
     """Return the linearised equations of some sights, beside their share of the prior information."""
     most_equations = 12_000  # to estimate how rough a lens is; of more, those of some views
-    problem, estimate = end.problem, end.estimate
-    every = max(1, -(-problem.sights.equations // most_equations))
-    sights = problem.sights[::every]
+    problem, estimate, reduced = end.problem, end.estimate, end.information
+    sights = problem.sights[:: max(1, -(-problem.sights.equations // most_equations))]
     equations = equations_of(sights, estimate, end.residuals)
     weights = equation_weights(problem.weighting, equations, end.residuals).within_sigma
     model = linearise_within(problem, estimate, equations, weights, reduced.shared)
