@@ -45,13 +45,15 @@ def read_grey(path: str | Path) -> Image:
 
 def read_light(path: str | Path) -> Array32:
     """Read an image as (height, width) grey levels, 0 to 255 whatever its depth, in which all pixels of a colour sensor
-    have equal weight: see `light`.
+    have equal weight: see `light`. Files of 16 bits may hold the 8, 10 or 12 bits of a sensor; a picture in which all
+    16 are used is brighter.
 
     Raises:
         InputError: see `read_grey`.
     """
-    picture = read_colour(path)
-    return light(picture) * np.float32(255.0 / np.iinfo(picture.dtype).max)
+    picture, depths = read_colour(path), (8, 10, 12, 16)
+    white = next(level for level in (2**bits - 1 for bits in depths) if np.max(picture) <= level)
+    return light(picture) * np.float32(255.0 / white)
 
 
 def light(image: Image) -> Array32:
