@@ -20,6 +20,7 @@ from accuracy.bound import bound, make_trial
 from accuracy.intervals import CASES, cover, share
 from accuracy.odd_scenes import LENSES as ODD_LENSES
 from accuracy.scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
+from photos.outcomes import STATED, Places, foreseen_of
 from scenery import board_scene, field_scene, overhead_pose
 from scenes import RADIAL, SCENES
 from scenes import camera as camera_of
@@ -228,6 +229,22 @@ def test_another_lens_is_followed_over_the_floor() -> None:
     for other, shift, left in zip(lenses.others, shifts, (0.02, 0.7), strict=True):  # 0.004 and 0.5
         off = other.camera_at("overhead").locate(pixels) - camera.locate(pixels)
         assert np.linalg.norm(slopes @ shift - off) < left * np.linalg.norm(off)
+
+
+@pytest.mark.thorough
+def test_a_posterior_foresees_how_often_its_statement_is_half_or_twice_the_error() -> None:
+    """All places move together, with a few numbers: an rms over a field is often far from what is stated."""
+    x, y = np.meshgrid(np.linspace(-4.0, 4.0, 9), np.linspace(-2.5, 2.5, 6))
+    floor, below, foreseen = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), [], []
+    pixels = make_trial(tilted(25.0), CLEAN_NOISE, 0).truth.camera_at("overhead").project(floor)
+    for seed in range(30):
+        calibration = calibrated(25.0, seed)
+        located = calibration.uncertainty.located(pixels)
+        off = np.linalg.norm(located.located - floor[:, :2], axis=1)
+        below.append(np.mean(off**2) < np.mean(located.sd_m**2) / STATED**2)
+        foreseen.append(foreseen_of(calibration, Places(pixels, floor[:, :2]), located).below)
+    scatter = np.sqrt(np.sum(np.array(foreseen) * (1.0 - np.array(foreseen))))
+    assert np.sum(foreseen) > 1.0 and abs(np.sum(below) - np.sum(foreseen)) < 3.0 * scatter  # 13 and 9.6 +- 2.6
 
 
 def test_a_length_is_as_uncertain_as_lenses_disagree_about_it() -> None:

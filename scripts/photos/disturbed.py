@@ -25,7 +25,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, custom, ssl_field, targets_by_name
 from ceres_cal.simulate import Station
-from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, Places, outcome
+from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, Places, outcome, rows_of_foreseen
 from photos.painters import (
     Painter,
     as_farmers_do,
@@ -188,14 +188,17 @@ def came_of(shot: DisturbedShot, asked: Target) -> Outcome:
 
 def disturbed_rows(runs: int, kinds: Sequence[str] = tuple(KINDS)) -> Iterator[Row]:
     """For each kind: share found, time, accuracy, and honesty of the stated accuracy."""
+    all_kinds = list[Outcome]()
     for name in kinds:
-        kind, every = KINDS[name], []
+        kind, every = KINDS[name], list[Outcome]()
         for seed, one in enumerate(over(partial(_disturbed, name), range(runs))):
             every.append(one)
             said = one.why or f"{one.mean_mm:.2f} mm, {one.over_stated:.2f} of stated"
             wrong = f", WRONG BUT TRUSTED ({100.0 * one.beyond:.0f} % beyond)" if one.certified else ""
             print(f"{name} {seed}: {said}, {one.lens} {one.seconds:.1f} s{wrong}", file=sys.stderr)
         yield from _rows(name, every, kind.most_mm)
+        all_kinds += [one for one in every if not one.why]
+    yield from rows_of_foreseen("all kinds", all_kinds)
 
 
 def _disturbed(name: str, seed: int) -> Outcome:
@@ -219,7 +222,7 @@ def _rows(name: str, every: Sequence[Outcome], most_mm: float) -> Iterator[Row]:
     note = f"{len(ratios) - len(known)} without a statement"
     yield Row(name, "rms error over stated", ratio, 0.0, 1.0 / STATED, STATED, note)
     yield Row(name, "wrong without saying so", int(np.sum(ratios > WRONG)), most=0.0)
-    yield Row(name, "wrong, but trusted", sum(one.certified for one in found), most=0.0)
+    yield from rows_of_foreseen(name, found)
     yield Row(name, "share trusted for something", float(np.mean([one.trusted for one in found])))
 
 

@@ -17,7 +17,7 @@ from scipy.interpolate import griddata
 
 from ceres_cal.detect.photographs import Auto, Clicks, Facing
 from ceres_cal.scene.targets import targets_by_name
-from photos.outcomes import MOST_BEYOND, MOVED_MM, STATED, USUAL_MM, Outcome, Places, outcome
+from photos.outcomes import MOST_BEYOND, MOVED_MM, STATED, USUAL_MM, Outcome, Places, outcome, rows_of_foreseen
 
 CLICK_PX = 8.0
 _CORNERS = (
@@ -162,6 +162,8 @@ def _of_all(found: Mapping[str, Sequence[Outcome]]) -> Iterator[Row]:
     ratios = np.sqrt(np.mean([one.over_stated**2 for one in every if np.isfinite(one.stated_mm)]))
     yield Row("all photographs", "rms error over stated", float(ratios), least=1.0 / STATED, most=STATED)
     yield Row("all photographs", "wrong, but trusted", sum(one.certified for one in every), most=0.0)
+    once = [next(one for one in ways if not one.why) for ways in found.values() if not all(one.why for one in ways)]
+    yield from rows_of_foreseen("each once", once)  # both ways of a photograph have the same error
     sound = [one for one in every if not one.beyond > MOST_BEYOND and one.mean_mm < MOVED_MM]
     trusted = float(np.mean([one.trusted for one in sound]))
     yield Row("sound", "share trusted for something", trusted, least=_SOUND, note=f"{len(sound)} calibrations")

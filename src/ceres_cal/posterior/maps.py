@@ -360,7 +360,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
         camera: the only camera that it depends on; "" where it depends on several.
     """
     mixture, width = posterior.mixture(camera), posterior.half_width
-    values, covariances = _of_components(mixture, estimate, shown, posterior.lenses, width, camera)
+    values, covariances = of_components(mixture, estimate, shown, posterior.lenses, width, camera)
     # Components that show nothing at a place: with so small a share of all they do not change its 95 % radius by 2 %.
     negligible = 0.005
     hidden = np.isnan(values).any(axis=2) | np.isnan(covariances).any(axis=(2, 3))
@@ -369,7 +369,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     return Reading(*mixture.refined(values, covariances), lost, width, mixture.is_followed)
 
 
-def _of_components(
+def of_components(
     mixture: Mixture, estimate: Estimate, shown: Functional, lenses: Sequence[Estimate], width: float, camera: str
 ) -> tuple[Array, Array]:
     """(C, N, 2) values of each component, relative to the estimate's, and (C, N, 2, 2) covariances.
