@@ -158,7 +158,9 @@ def test_each_of_many_is_judged_as_it_is_alone(name: str) -> None:
 def test_how_smooth_a_lens_is_is_no_news() -> None:
     calibration = calibrate(observed("whole field, 8 deg"), Options(lens="spline"))
     ground, _ = _prepared(calibration, None, 0.15)
-    (tape,) = [one.measurement for one in advised("whole field, 8 deg").promises if "position" in str(one.measurement)]
+    (tape,) = [
+        one.measurement for one in advised("whole field, 8 deg").promises if "position" in str(one.measurement.priors)
+    ]
     told = ground.information_of(tape)
     of_lens = [number for number, key in enumerate(told.keys) if key.kind == "camera"]
     assert len(of_lens) > 10 and not np.any(told.matrix[of_lens])

@@ -75,6 +75,8 @@ def test_it_is_a_dataclass_to_everybody() -> None:
     assert [one.name for one in fields(ring)] == ["places", "name", "notes", "colour"]
     assert replace(ring, colour=2).colour == 2
     assert repr(ring) == "ColouredRing(places=array([0., 0.]), name='red', notes=[], colour=1)"
+    long = repr(replace(ring, places=np.zeros(300)))  # a line for each part
+    assert long == "ColouredRing(\n  places=<array 300>\n  name='red'\n  notes=[]\n  colour=1)"
     for again in (copy.copy(ring), pickle.loads(pickle.dumps(ring))):
         assert (again.name, again.colour, again.size) == ("red", 1, 2)
     with pytest.raises(TypeError, match="colour"):

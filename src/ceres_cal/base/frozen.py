@@ -76,8 +76,12 @@ class Frozen:
         raise FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __repr__(self) -> str:
+        from ceres_cal.base.shown import brief
+
+        most = 300  # letters: of what is longer, a line for each part
         held = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.__dataclass_fields__)
-        return f"{type(self).__qualname__}({held})"
+        text = f"{type(self).__qualname__}({held})"
+        return text if len(text) <= most else brief(self)
 
 
 def _are_equal(one: Any, other: object) -> Any:

@@ -20,8 +20,8 @@ Shown = tuple[str, Sequence[tuple[str, ...]]]
 
 def brief(instance: Any) -> str:
     """Return the `__repr__` of an object with large parts: its class, and a line for each of its first fields."""
-    every = {name: value for name, value in vars(instance).items() if name[0] != "_"}
-    lines = [f"  {name}={_short(value)}" for name, value in list(every.items())[: _MOST_LINES - 1]]
+    names = [name for name in instance.__dataclass_fields__ if name[0] != "_"]
+    lines = [f"  {name}={_short(getattr(instance, name))}" for name in names[: _MOST_LINES - 1]]
     return "\n".join([f"{type(instance).__name__}(", *lines]) + ")"
 
 

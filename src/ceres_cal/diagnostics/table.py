@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Codes, Indices, InputError, Mask, brief, numbers_of, write_bytes, write_json
+from ceres_cal.base import AnyArray, Array, Codes, Indices, InputError, Mask, numbers_of, write_bytes, write_json
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations, column_of
@@ -64,8 +64,6 @@ class ResidualTable(Frozen):
     standardised: Array
     radius_px: Array
     reason: Codes
-
-    __repr__ = brief
 
     def __len__(self) -> int:
         return len(self.row)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import HEIGHTS_M, Array, InputError, Mask, SolutionError, brief, rms, text_of
+from ceres_cal.base import HEIGHTS_M, Array, InputError, Mask, SolutionError, rms, text_of
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
 from ceres_cal.calibration import Calibration
@@ -46,8 +46,6 @@ class FieldDifference(ErrorMap):
     difference_mm: Array
     expected_mm: Array
     lost: Mask
-
-    __repr__ = brief
 
     @property
     def errors_mm(self) -> Array:
@@ -84,8 +82,6 @@ class MapChange(Frozen):
     shift_px: float
     maps: tuple[FieldDifference, ...]
 
-    __repr__ = brief
-
 
 class ImageDifference(Frozen):
     """The difference between the pixels at which two cameras see the same directions, over the image.
@@ -104,8 +100,6 @@ class ImageDifference(Frozen):
     difference_px: Array
     angles_deg: Array
     turn_deg: float
-
-    __repr__ = brief
 
     @property
     def errors_px(self) -> Array:
@@ -171,8 +165,6 @@ class Agreement(Frozen, kw_only=True):
     views: tuple[Agreement, ...] = ()
     pose_free: bool = False
     solution: Calibration | None = None
-
-    __repr__ = brief
 
 
 class Agreements(Frozen, Mapping[str, Agreement]):

@@ -43,8 +43,6 @@ class PointSpread(Frozen):
     radius_95_m: Array
     sd_m: Array
 
-    __repr__ = brief
-
 
 def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tuple[Key, ...]:
     """Return the keys of a station and of its camera.

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, Spread, brief, cached_property, field, replace, without
+from ceres_cal.base import Array, Frozen, InputError, Mask, Spread, cached_property, field, replace, without
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.base.words import did_you_mean
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
@@ -60,8 +60,6 @@ class Posterior(Frozen):
     stated: Information = field(default_factory=Information.nothing)
     lenses: tuple[Estimate, ...] = ()
     lens_information: tuple[Information, ...] = ()
-
-    __repr__ = brief
 
     @property
     def keys(self) -> tuple[Key, ...]:

@@ -12,7 +12,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, InputError, Pose, Poses, brief, chained, inverted, no_such, take_types
+from ceres_cal.base import Array, Indices, InputError, Pose, Poses, chained, inverted, no_such, take_types
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.observations import Observations, Owner, Prior, SightKey
 from ceres_cal.problem.structure import Structure, Tolerance, make_structure
@@ -264,8 +264,6 @@ class Estimate(Frozen, eq=True):
     """world_from_target of each placement."""
     structure: Structure
     """The targets as built."""
-
-    __repr__ = brief
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "placements", Poses.of(self.placements))  # costs nothing when repeated

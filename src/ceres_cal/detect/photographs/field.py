@@ -13,7 +13,6 @@ from ceres_cal.base import (
     Array32,
     Frozen,
     Mask,
-    brief,
     distinct,
     for_small_matrices,
     frame_of,
@@ -77,8 +76,6 @@ class FieldDetections(Frozen):
     found: dict[str, FieldLines]
     missed: tuple[tuple[str, str], ...]
     searched: dict[str, SearchResult]
-
-    __repr__ = brief
 
 
 class FieldOptions(Frozen, eq=True):

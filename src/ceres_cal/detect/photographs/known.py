@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 
-from ceres_cal.base import Frozen, ImageProgress, InputError, NothingShownError, brief, replace
+from ceres_cal.base import Frozen, ImageProgress, InputError, NothingShownError, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.detect.photographs.field import FieldDetections, FieldOptions, detect_field
@@ -35,8 +35,6 @@ class KnownDetections(Frozen):
     shown: dict[str, int]
     missed: tuple[tuple[str, str], ...]
     images: int
-
-    __repr__ = brief
 
     def require(self) -> Observations:
         """Return the observations; NothingShownError where there are none."""

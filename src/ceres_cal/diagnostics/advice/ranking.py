@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_matrices, numerical, replace, text_of
+from ceres_cal.base import ROBOT_TOP_M, Frozen, checked, each, for_small_matrices, numerical, replace, text_of
 from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.base.words import short
 from ceres_cal.calibration import Calibration, Fit
@@ -41,8 +41,6 @@ class Promise(Frozen):
     after: Errors
     rough: bool = False
     valley: tuple[tuple[float, Errors], ...] = ()
-
-    __repr__ = brief
 
     @property
     def worst_range_mm(self) -> tuple[float, float]:
