@@ -154,7 +154,9 @@ def test_targets_without_lines_at_right_angles() -> None:
 # ---- the search -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", partly(["quarter", "tilted 20 to 45 degrees"], ["quarter"]))
+@pytest.mark.parametrize(
+    "view", partly(["quarter", "tilted 20 to 45 degrees", "tilted 50 to 70 degrees"], ["tilted 50 to 70 degrees"])
+)
 def test_views_of_any_kind(view: str) -> None:
     shot = auto_script.take_view(view, auto_script.VIEWS[view], 1)
     (found,) = auto_script.searched(iter([shot]))

@@ -25,14 +25,13 @@ from ceres_cal.detect.photographs.field import _observations
 from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.photographs.grid import Facing
 from ceres_cal.detect.photographs.matching import StrokeMap
-from ceres_cal.detect.photographs.refit import observations_of, refit_camera
+from ceres_cal.detect.photographs.refit import observations_of
 from ceres_cal.detect.photographs.search import _contradiction, search
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.report.document import Document
-from ceres_cal.scene import curve_points
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Arc, Segment, Target, custom, ssl_field
@@ -328,16 +327,3 @@ def test_auto_takes_no_other_target(path: Path) -> None:
         NothingShownError, match=rf"no field in any of 1 images; {path}: .*(corners|dimensions|it shows ssl-b)"
     ):
         detect_field([path], ssl_field("A"), Auto())
-
-
-@pytest.mark.parametrize("height_m, is_usable", [(0.05, False), (0.5, True)])
-def test_a_camera_in_the_floor_shows_no_field(height_m: float, is_usable: bool) -> None:
-    """Seen along the floor, all lines are one: a photograph from a corner was "found" with a camera 0.2 mm above it."""
-    look = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # along x, level
-    camera = replace(CAMERA, cam_from_world=Pose(look, -look @ np.array([-6.0, 0.4, height_m])))
-    points = np.concatenate([curve_points(FIELD.curves[name], 0, 12) for name in FIELD.curve_names])
-    curve = np.repeat(np.arange(len(FIELD.curve_names), dtype=np.int32), len(points) // len(FIELD.curve_names))
-    pixels = camera.project(points)
-    shown = np.isfinite(pixels).all(axis=1)
-    seen = observations_of(FIELD, CAMERA.image_size, curve[shown], pixels[shown], np.full(np.count_nonzero(shown), 0.1))
-    assert (refit_camera(camera, seen) is not None) == is_usable

@@ -65,12 +65,20 @@ def tilted(rng: np.random.Generator) -> tuple[float, float, float, float, float]
     return (*rng.uniform((-1.5, -0.3), (1.5, 0.3)), rng.uniform(3.5, 5.0), rng.uniform(20.0, 45.0), rng.uniform(0, 360))
 
 
+def beside(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
+    """Taken by hand beside the field; x and y are the place it looks at."""
+    return (*rng.uniform((-1.5, -0.5), (1.5, 0.5)), rng.uniform(1.7, 3.5), rng.uniform(50.0, 70.0), rng.uniform(0, 360))
+
+
 def near(rng: np.random.Generator) -> tuple[float, float, float, float, float]:
     """So near that the picture often does not determine the place; a result must be right nevertheless."""
     return (*rng.uniform((-4.2, -2.7), (4.2, 2.7)), rng.uniform(1.2, 2.8), rng.uniform(0.0, 25.0), rng.uniform(0, 360))
 
 
-VIEWS = {"whole": whole, "half": half, "quarter": quarter, "tilted 20 to 45 degrees": tilted, "wide lens": half}
+VIEWS = {
+    **{"whole": whole, "half": half, "quarter": quarter, "tilted 20 to 45 degrees": tilted},
+    **{"tilted 50 to 70 degrees": beside, "wide lens": half},
+}
 
 
 def take_view(name: str, view: Callable[[np.random.Generator], tuple[float, ...]], seed: int) -> Shot:

@@ -259,13 +259,13 @@ def other(name: str, seed: int) -> tuple[DisturbedShot, Target]:
 
 
 def wrong_rows(runs: int) -> Iterator[Row]:
-    """Photographs of other fields than asked for: none may be certified."""
+    """Photographs of other fields than asked for: all must be refused, or not trusted."""
     names = (*OTHERS, "B for A", "A for B", "none")
     certified: dict[str, list[str]] = {name: [] for name in names}
     asked = [(names[number % len(names)], number // len(names)) for number in range(runs)]
     for (name, seed), came in zip(asked, over(_wrong, *zip(*asked, strict=True)), strict=True):
-        print(f"{name} {seed}: {came.why or 'CERTIFIED'}, {came.seconds:.1f} s", file=sys.stderr)
-        if not came.why:
+        print(f"{name} {seed}: {came.why or came.verdict}, {came.seconds:.1f} s", file=sys.stderr)
+        if came.trusted:
             certified[name].append(f"{seed}: {came.mean_mm:.0f} mm")
     for name in names[: min(runs, len(names))]:
         yield Row("another field", name, len(certified[name]), most=0.0, note=", ".join(certified[name]))

@@ -151,13 +151,11 @@ def refit_camera(
         priors: on them, and on dimensions that are estimated.
         weighting: noise and loss; by default far outliers have no influence.
     """
-    lowest = 0.01  # height as a share of the field's extent: below, its middle is seen at an angle of a degree
     problem, estimate = problem_of(camera, observations, free, priors, weighting)
     solution = solve(problem, estimate, precision=1e-6)
     refitted = solution.estimate.camera_at(STATION)
     finite = np.all(np.isfinite(refitted.position))
-    extent_m = float(np.max(np.ptp(observations.targets[TARGET].box, axis=0)))
-    usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > lowest * extent_m
+    usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > 0.0
     found = solution.estimate.structure.dimensions
     lengths = {name.partition("/")[2]: length for name, length in found.items()}
     if not usable or not all(length > 0.0 for length in lengths.values()):

@@ -90,7 +90,7 @@ def search(
 
     The picture must show straight lines at right angles, at least two one way and one across; all other curves of the
     target help to decide between possible views. Of the lens it is only assumed that it is approximately radial and
-    centred. The camera looks down, tilted by up to 55 degrees. A mirrored photograph of a field that is its own mirror
+    centred. The camera looks down, tilted by up to 70 degrees. A mirrored photograph of a field that is its own mirror
     image looks like another field's; this cannot be detected.
 
     Args:

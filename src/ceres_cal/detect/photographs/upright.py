@@ -30,7 +30,7 @@ _USUAL_TILT = 0.5
 # from half to double.
 _PRIOR_WEIGHT = 0.03
 # Tilt in degrees, and number of directions of the tilt.
-_RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))
+_RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24), (63.0, 26), (71.0, 28))
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off, in the first and the last round
 # Least share of the strokes in the direction that has fewer, as a floor needs both. Nothing changes from half to
