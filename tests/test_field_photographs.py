@@ -143,6 +143,17 @@ def test_a_moved_camera_draws_no_line_aside(turned: bool) -> None:
     assert abs(np.nanmean(found.offset_px)) < 0.03  # 0.00 px; 0.3 px where the search is half a step aside
 
 
+def test_lines_in_any_direction_are_found_in_a_picture_with_hardly_any_noise() -> None:
+    """The profile model leaves more of clean paint in some directions than in others, which is no sign of anything."""
+    pose, target = overhead_pose(0.1, 0.2, 5.0, 4.0, 3.0, 40.0), ssl_field("B")
+    camera = Camera((780, 580), 345.0, (390.0, 290.0), Radial((-1.1e-4, 1.6e-6)))
+    scene = field_scene(target, {"overhead": camera}, {"overhead": Station("overhead", pose)})
+    clean = Photography(blur_px=0.9, robots=0, balls=0, carpet_texture=0.0, read_noise=0.3)
+    course = predict(target, scene.camera_at("overhead"), target.curve_names, SPACING_PX, 12.0)
+    lines = measure(light(photograph(scene, "overhead", "0001", clean, 1).image), course, 3.0)
+    assert np.mean(lines.found) > 0.95  # 0.983, and 0.825 by what is usual of the noise alone
+
+
 def test_what_windows_cannot_know_is_added_to_their_sigmas() -> None:
     """Paint thinner than a pixel, sampled without blur: errors of a tenth of a pixel, correlated
     over several places.
