@@ -164,6 +164,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.lines", "_LEAST_CLARITY _LEAST_CONTRAST _OF_NEARBY _NOISY _WANDERING _FAR", "lines"),
     *_of("detect.strokes", "_LEAST_PX _STRAIGHT_PX _NOISE _NOISE_NEARBY _WIDEST _COARSER _OWN", "auto"),
     *_of("detect.saddles", "_LOST _FAINT", "boards"),
+    *_of("detect.april_grids", "_OTHER_GAP", "boards"),
     *_of("detect.boards", "_MOST_PX _UNEVEN _LONG _LEAST_SIDE_PX", "boards"),
     *_of("detect.partly", "_MISFIT _AS_STRONG _CLEAR _ENDED", "boards"),
     *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),

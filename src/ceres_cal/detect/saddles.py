@@ -73,7 +73,7 @@ class Saddles(Frozen):
         return Saddles(*(np.where(wrong.T, np.nan, values.T).T for values in vars(self).values()))
 
 
-def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddles:
+def measure_saddles(image: AnyArray, grid: Array, reach: float | Array = REACH) -> Saddles:
     """Measure the corners of a board near where a detector saw them.
 
     A corner is left out (NaN) where the fit moves away from its start, where the contrast has the wrong sign for its
@@ -84,7 +84,8 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
         image: (height, width), any depth.
         grid: (rows, columns, 2) px, right-handed (columns x rows > 0 in the image), accurate to a few pixels; NaN where
             nothing was seen.
-        reach: radius of the disc around a corner, as a share of the distance to the next edges.
+        reach: radius of the disc around a corner, as a share of the distance to the next edges; one for all, or (rows,
+            columns).
     """
     fitted = fit_saddles(image, grid, np.ones(grid.shape[:2], dtype=bool), reach)
     rows, columns = np.indices(fitted.contrast.shape)
@@ -93,7 +94,7 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
     return fitted.without(~(signed * np.sign(usual) > max(_FAINT * np.abs(usual), _ROUNDING * float(np.max(image)))))
 
 
-def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH) -> Saddles:
+def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float | Array = REACH) -> Saddles:
     """Fit saddles near the wanted corners (rows, columns) of a grid; the other corners only give the directions of
     edges.
     """
@@ -151,7 +152,7 @@ def _started(fitted: Array, seen: Array, wanted: Mask) -> Array:
     return start
 
 
-def _shrink(fitted: Array, distance: Array, reach: float) -> int:
+def _shrink(fitted: Array, distance: Array, reach: float | Array) -> int:
     """Return the factor by which the picture is shrunk for the last fit. It is as large as the blur allows, and larger
     than 1 only where a disc of the most pixels would see only a part of each square, or nothing but blur.
     """
@@ -167,7 +168,7 @@ def _shrunk(level: AnyArray, factor: int) -> AnyArray:
     return cv2.resize(level[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _fit_grid(smooth: AnyArray, start: Array, edges: _Edges, seen: Array, discs: tuple[float, Mask]) -> Array:
+def _fit_grid(smooth: AnyArray, start: Array, edges: _Edges, seen: Array, discs: tuple[float | Array, Mask]) -> Array:
     """Fit the wanted corners once; return (rows, columns, _FITTED), NaN where one moved too far from where it was
     `seen`. `start`: places, for a rough fit with straight edges, or the result of such a fit. `edges`: geometry of the
     edges at the start. `discs`: their reach, and the mask of the wanted corners.
@@ -185,7 +186,7 @@ def _fit_grid(smooth: AnyArray, start: Array, edges: _Edges, seen: Array, discs:
     else:
         along = np.stack([along_row[known], along_column[known]], axis=1)
         begun[:, _ANGLES], begun[:, _LEFT:-1] = np.arctan2(along[..., 1], along[..., 0]), 0.0
-    begun[:, -1] = np.clip(reach * distance[known], *_RADIUS_PX)
+    begun[:, -1] = np.clip((reach * distance)[known], *_RADIUS_PX)
     params = np.empty_like(begun)
     kernels.fit_saddles(smooth, begun, params)
     moved = np.linalg.norm(params[:, :2] - seen[known], axis=1)
