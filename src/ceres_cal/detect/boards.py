@@ -29,7 +29,8 @@ _CHECKERED = ("checkerboard", "charuco")
 _COUNTED = {**dict.fromkeys(_CHECKERED, "inner corners"), "circle-grid": "circles", "april-grid": "tags"}
 _HINTS = {
     **dict.fromkeys(_CHECKERED, " (count the corners between squares, not the squares)"),
-    **dict.fromkeys(("circle-grid", "april-grid", "markers"), ""),
+    "circle-grid": " (columns are the circles of one row; in an asymmetric grid every other row is half a step off)",
+    **dict.fromkeys(("april-grid", "markers"), ""),
 }
 # (width + height)^2 / _LONG counts as the number of pixels of a long image. That exceeds width x height only from sides
 # of 1 : 14 on, longer than any camera's picture.
@@ -109,7 +110,7 @@ def detect_boards(
     find = finder_of(board, corner_fit)
     placements = _placement_names(paths) if board.movable else dict.fromkeys(paths)
     # OpenCV's marker detectors keep state, which threads would share.
-    each = in_turn if board.kind == "checkerboard" else map
+    each = in_turn if board.kind in ("checkerboard", "circle-grid") else map
     size, grids, missed = _find_all(paths, find, each, progress)
     if _is_refuted(grids, missed):
         missed.sort(key=lambda one: NO_PLACE not in one[1])
@@ -190,9 +191,7 @@ def _markers_instead(board: Target, path: Path) -> str:
 def finder_of(board: Target, corner_fit: str = "saddle") -> Finder:
     """Return a function that finds a board in an image; InputError for no board, too small a one or unknown markers."""
     if board.kind == "circle-grid":
-        from ceres_cal.detect.circles import measured_circles
-
-        return lambda image: measured_circles(_as_8_bit(image), board)
+        return lambda image: _circles(image, board)
     if board.kind == "april-grid":
         from ceres_cal.detect.april_grids import measured_april_grid
 
@@ -213,6 +212,28 @@ def finder_of(board: Target, corner_fit: str = "saddle") -> Finder:
     if corner_fit not in CORNER_FITS:
         raise InputError(no_such("corner fit", corner_fit, CORNER_FITS))
     return lambda image: _measured_chessboard(image, columns, rows, corner_fit)
+
+
+def _circles(image: Image, board: Target) -> Array | str:
+    """Find circles in smaller pictures first, which is faster and has less noise; measure them in full size."""
+    from ceres_cal.detect.circles import measured_circles
+
+    levels = _stretched(image[::_SAMPLED, ::_SAMPLED], image)
+    found: Array | str = "the picture is too narrow for a grid of circles"
+    for most, pixels in ((2.0, _FAST_PX), (1.0, _LARGE_PX)):
+        scaled = _resized(levels, min(most, float(np.sqrt(pixels / image.size))))
+        if min(scaled.shape) < _LEAST_SIDE_PX:
+            continue
+        found = measured_circles(scaled, board)
+        if isinstance(found, str):
+            continue
+        found = _places_in(image, scaled, found).reshape(found.shape)
+        margin = float(np.max(steps_px(found)))
+        low = np.maximum(found.min(axis=(0, 1)) - margin, 0.0).astype(int)
+        right, below = (found.max(axis=(0, 1)) + margin + 1.0).astype(int)
+        again = measured_circles(levels[low[1] : below, low[0] : right], board)
+        return found if isinstance(again, str) else again + low
+    return found
 
 
 def _charuco_finder(board: Target, grid: Grid) -> Finder:

@@ -19,20 +19,38 @@ _RIM = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 def measured_circles(image: Image8, board: Target) -> Array | str:
-    """Return the centres (rows, columns, 2) px, or the reason why there are none."""
+    """Return the centres (rows, columns, 2) px of dark or of bright circles, or the reason why there are none.
+
+    Args:
+        image: stretched from black to white, since OpenCV looks for spots at fixed levels of grey.
+    """
     columns, rows, asymmetric = (board.spec[name] for name in ("columns", "rows", "asymmetric"))
     layout = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    # The second way also finds tilted boards, and boards in clutter.
-    for how in (layout, layout | cv2.CALIB_CB_CLUSTERING):
-        shown, seen = cv2.findCirclesGrid(image, (columns, rows), flags=how)
-        if shown:
-            grid = np.asarray(seen.reshape(rows, columns, 2), dtype=float)
-            if _is_mirrored(grid):
-                if asymmetric:  # an asymmetric grid turned over is another grid
-                    return f"a grid of {columns} x {rows} circles, but seen mirrored"
-                grid = grid[:, ::-1]
-            return _centres(grid, board.point_array[:, :2], 0.5 * board.spec["diameter_m"])
-    return f"no grid of {columns} x {rows} circles found"
+    grid = _middles_seen(image, columns, rows, layout)
+    if grid is None:
+        return f"no grid of {columns} x {rows} circles found"
+    if _is_mirrored(grid):
+        if asymmetric:  # an asymmetric grid turned over is another grid
+            return f"a grid of {columns} x {rows} circles, but seen mirrored"
+        grid = grid[:, ::-1]
+    return _centres(grid, board.point_array[:, :2], 0.5 * board.spec["diameter_m"])
+
+
+def _middles_seen(image: Image8, columns: int, rows: int, layout: int) -> Array | None:
+    """Return the middles (rows, columns, 2) px of the pictures of circles, None where OpenCV finds no grid of them."""
+    spots = cv2.SimpleBlobDetector.Params()
+    # OpenCV's own limit is a circle 80 px across. Larger spots than this hide the circles around their middle.
+    spots.maxArea = image.size / (columns * rows)
+    for spots.blobColor in (0, 255):
+        detector = cv2.SimpleBlobDetector.create(spots)
+        if len(detector.detect(image)) < columns * rows:  # the search would look for them anew for each layout
+            continue
+        # The second layout also finds tilted boards, and boards in clutter.
+        for how in (layout, layout | cv2.CALIB_CB_CLUSTERING):
+            shown, seen = cv2.findCirclesGrid(image, (columns, rows), flags=how, blobDetector=detector)
+            if shown:
+                return np.asarray(seen.reshape(rows, columns, 2), dtype=float)
+    return None
 
 
 def _is_mirrored(grid: Array) -> bool:
