@@ -492,11 +492,14 @@ def test_markers_in_other_places_are_another_board(tmp_path: Path, markered: tup
             detect_boards([path], board)
 
 
-def test_a_board_with_markers_that_is_said_to_have_none(tmp_path: Path, markered: tuple[Image8, Array]) -> None:
+def test_the_markers_of_another_board_are_named(tmp_path: Path, markered: tuple[Image8, Array]) -> None:
+    path = write(tmp_path / "a.png", markered[0])
     with pytest.raises(
         InputError, match=r"it shows markers of DICT_4X4_50: a board with markers is of kind charuco or"
     ):
-        detect_boards([write(tmp_path / "a.png", markered[0])], checkerboard(8, 6, 0.04))
+        detect_boards([path], checkerboard(8, 6, 0.04))
+    with pytest.raises(InputError, match=r"no ChArUco corners found; it shows markers of DICT_4X4_50$"):
+        detect_boards([path], charuco(7, 5, 0.04, 0.03, "DICT_5X5_250"))
 
 
 # ---- what is said ---------------------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ _HINTS = {
     "circle-grid": " (columns are the circles of one row; in an asymmetric grid every other row is half a step off)",
     **dict.fromkeys(("april-grid", "markers"), ""),
 }
+_MARKERS_SEEN = "though markers of its dictionary"
 # (width + height)^2 / _LONG counts as the number of pixels of a long image. That exceeds width x height only from sides
 # of 1 : 14 on, longer than any camera's picture.
 _LONG = 16
@@ -114,7 +115,7 @@ def detect_boards(
     size, grids, missed = _find_all(paths, find, each, progress)
     if _is_refuted(grids, missed):
         missed.sort(key=lambda one: NO_PLACE not in one[1])
-        seen, searched = _markers_instead(board, Path(missed[0][0])), len(grids) + len(missed)
+        seen, searched = _markers_instead(board, *missed[0]), len(grids) + len(missed)
         where = f"any of {searched}" if searched == len(paths) else f"the first {searched} of {len(paths)}"
         reason = f"in {where} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}{seen}"
         raise NothingShownError(f"no {_what(board)} {reason}", tuple(missed))
@@ -175,17 +176,17 @@ def _find_all(
     return size, grids, missed
 
 
-def _markers_instead(board: Target, path: Path) -> str:
-    """Return an addition to the error message for an image that shows markers instead of the chessboard; else ""."""
-    if board.kind != "checkerboard":
+def _markers_instead(board: Target, path: str, reason: str) -> str:
+    """Return an addition to the error message for an image that shows markers the board does not have; else ""."""
+    if board.kind not in _CHECKERED or _MARKERS_SEEN in reason:
         return ""
     from ceres_cal.detect.markers import dictionary_shown
 
-    shown = dictionary_shown(_as_8_bit(read_grey(path)))
+    shown = dictionary_shown(_as_8_bit(read_grey(Path(path))))
     kinds = (
-        "a board with markers is of kind charuco or april-grid (`ceres-cal targets charuco` says how to describe it)"
+        ": a board with markers is of kind charuco or april-grid (`ceres-cal targets charuco` says how to describe it)"
     )
-    return f"; it shows markers of {shown}: {kinds}" if shown else ""
+    return f"; it shows markers of {shown}{kinds if board.kind == 'checkerboard' else ''}" if shown else ""
 
 
 def finder_of(board: Target, corner_fit: str = "saddle") -> Finder:
@@ -247,7 +248,7 @@ def _charuco_finder(board: Target, grid: Grid) -> Finder:
     def find(image: Image) -> Array | str:
         corners, ids, _, markers = detector.detectBoard(_as_8_bit(image))
         if ids is None or len(ids) == 0:
-            doubt = "" if markers is None else ", though markers of its dictionary: check columns, rows and legacy"
+            doubt = "" if markers is None else f", {_MARKERS_SEEN}: check columns, rows and legacy"
             return f"no ChArUco corners found{doubt}"
         every = np.full((grid.rows * grid.columns, 2), np.nan)
         every[ids.ravel()] = corners.reshape(-1, 2)
