@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import scenes
-from scenery import BoardRanges, board_scene
+from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError, SolutionError
@@ -25,7 +25,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate, Options, Station
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.robust.robust import solve_robustly
-from ceres_cal.scene.targets import Target, checkerboard
+from ceres_cal.scene.targets import Target, checkerboard, ssl_field
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.same_labels import with_same_labels
 from ceres_cal.start.same_moments import shown_otherwise
@@ -298,6 +298,20 @@ def test_a_lost_board_that_both_cameras_see_is_posed_again() -> None:
     lost = {**calibration.placements, name: Pose(pose.rotation, pose.translation + np.array([0.3, 0.2, 0.5]))}
     end = solve_robustly(calibration.problem(seen), replace(calibration.estimate, placements=lost), is_near=True)
     assert end.inliers.points.all()
+
+
+def test_a_frame_under_the_other_cameras_name_is_named() -> None:
+    """In the first or last of three frames all that it shows was rejected row by row, and nothing was said of it."""
+    stations = {name: Station(name, overhead_pose(x, 0.1, 5.0, 8.0, 3.0)) for name, x in (("left", -2.2), ("right", 2))}
+    cameras, other = dict.fromkeys(stations, scenes.camera("radial-2-3")), {"left": "right", "right": "left"}
+    scene = field_scene(ssl_field("B"), cameras, stations, 3, spacing_m=0.6)
+    seen, drawn = simulate(scene, Disturbance(0.3, 0.3), 1).observations, Options(lens="radial", as_built="as drawn")
+    views = [
+        replace(view, camera=other[view.camera], station=other[view.camera]) if view.frame == "0003" else view
+        for view in seen.views
+    ]
+    said = calibrate(replace(seen, views=tuple(views)), drawn).warnings
+    assert len([text for text in said if "of 1 of its 3 frames ('0003') were taken out" in text]) == 2, said
 
 
 def _in_other_frames(observations: Observations, frames: Mapping[str, str]) -> Observations:

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, Mask, SolutionError, attempt, distinct, median
+from ceres_cal.base import Array, CalibrationError, Mask, SolutionError, attempt, distinct, first_of, median
 from ceres_cal.effects import AsBuilt
-from ceres_cal.observations import SightKey, Sights
+from ceres_cal.observations import SightKey, Sights, column_of, shown_rows
 from ceres_cal.problem import Estimate, Problem, Residuals, floor_of
 from ceres_cal.problem.residuals import residuals as residuals_at
 from ceres_cal.problem.residuals import write_equations
@@ -234,7 +234,7 @@ def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
 
 
 class LostSight(NamedTuple):
-    """A sight with most observations rejected, so that its pose is not known.
+    """A sight with most observations rejected, so that its pose is not known; or a still camera's, in some frames.
 
     Attributes:
         words: for the user. is_alone: whether it is that of a placement that no other sight shows, so that nothing else
@@ -247,7 +247,7 @@ class LostSight(NamedTuple):
 
 
 def lost_sights(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterator[LostSight]:
-    """Yield the sights with most observations rejected one by one.
+    """Yield the sights with most observations rejected one by one, and those of still cameras of which some frames are.
 
     Args:
         groups: masks (N + M,) of the observations that were left out as one group each, which explains them.
@@ -257,6 +257,7 @@ def lost_sights(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> I
         used |= rows
     sights = problem.sights
     shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
+    yield from _lost_frames(sights, shares, (inliers.rows, *groups))
     lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < LOST)]
     otherwise: Mapping[tuple[str, str], str] = {}
     if any(key.placement not in (None, *sights.seen_once) for key, _ in lost):  # shared by a rig
@@ -270,6 +271,26 @@ def lost_sights(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> I
         checks = otherwise.get((key.station, str(key.placement)), usual)
         words = f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"
         yield LostSight(key, words, key.placement in sights.seen_once)
+
+
+def _lost_frames(sights: Sights, shares: Array, explained: Sequence[Mask]) -> Iterator[LostSight]:
+    """Yield sights that are not lost, but of which some frames are: nothing explains most of what these show.
+
+    Args:
+        explained: masks (N + M,) of the observations that are used, and of each group that was left out.
+    """
+    few = 8  # observations of a frame: of fewer, most may be outliers by chance
+    there, view, views = shown_rows(sights), column_of(sights.observations, "view"), sights.observations.views
+    every, *parts = (np.bincount(view[rows & there], minlength=len(views)) for rows in (there, *explained))
+    is_lost = (every >= few) & (np.max(parts, axis=0) < LOST * every)
+    for key, own, share in zip(sights.keys, sights.views, shares, strict=True):
+        frames = [repr(views[number].frame) for number in own if is_lost[number]]
+        if frames and share >= LOST and key.placement is None:
+            words = (
+                f"{key}: most observations of {len(frames)} of its {len(own)} frames ({first_of(frames)}) were taken "
+                "out: check that it took these pictures, that it did not move, and the labels"
+            )
+            yield LostSight(key, words, is_alone=False)
 
 
 # ---- targets whose points are not those of the drawing ---------------------------------------------------------------
