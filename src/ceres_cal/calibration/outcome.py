@@ -7,15 +7,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, DegenerateError, Indices, Mask, bounds_text, first_of, inverted, replace, two_digits
+from ceres_cal.base import (
+    Array,
+    DegenerateError,
+    Indices,
+    Mask,
+    bounds_text,
+    first_of,
+    grid_places,
+    inverted,
+    replace,
+    two_digits,
+)
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejection
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations, SightKey, View
+from ceres_cal.posterior.maps import visible_pixels
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
@@ -26,6 +39,7 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.noise import visible_from
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_possible
+from ceres_cal.scene.symmetry import TURNED, counterparts
 from ceres_cal.start.initialise import Start
 
 if TYPE_CHECKING:
@@ -60,6 +74,10 @@ _SQUARED = (
 _BEHIND = (
     "camera {!r} sees all {} checkerboards from behind: its pictures are mirrored, x and y of its pixels or rows and "
     "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
+)
+_TWICE = (
+    "stations {!r} and {!r} stand at one place and show the same part of {!r}, and no station shows the part opposite: "
+    "if they are apart, the labels of one are half a turn off (its --facing); if not, state their position_m"
 )
 _MIRRORED = (
     "target {!r} is seen from its other side in {} of {} views ({}): their pictures are mirrored, or their points are "
@@ -167,14 +185,53 @@ def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -
     return found
 
 
-def seen_from_behind(estimate: Estimate, observations: Observations, lost: Collection[str | None]) -> Iterator[str]:
+def other_ways_round(end: RobustSolution, problem: Problem, lost: Collection[str | None]) -> Iterator[str]:
+    """Yield warnings about targets that are probably seen another way round than their labels say, which fits as well.
+
+    Args:
+        lost: placements whose poses are not known.
+    """
+    yield from _seen_from_behind(end.estimate, problem.observations, lost)
+    stated = {
+        one.name for one in (*problem.observations.priors, *problem.options.priors) if one.quantity == "position_m"
+    }
+    for name in dict.fromkeys(view.target for view in problem.observations.shown_views if view.placement is None):
+        yield from _seen_twice(end.estimate, problem.observations, name, stated)
+
+
+def _seen_twice(estimate: Estimate, observations: Observations, name: str, stated: Collection[str]) -> Iterator[str]:
+    """Check a field that looks the same after half a turn: do two stations at one place show one part of it, and none
+    the part opposite? Boards that both see, or positions that were stated, decide it.
+    """
+    near, steps = 0.2, 24  # distance over height; places along each side
+    same, unseen = 0.3, 0.15  # shares of the part that is shown; with these, none of 960 rigs of 2 and 4 is named
+    target, boards = observations.targets[name], dict[str, set[str | None]]()
+    if not target.curves or min(counterparts(target, TURNED)[1]) < 0:
+        return
+    low, high = target.box
+    places = grid_places(*(np.linspace(low[axis], high[axis], steps) for axis in (0, 1)))
+    for view in observations.shown_views:
+        boards.setdefault(view.station, set()).add(view.placement)
+    looking = dict.fromkeys(view.station for view in observations.shown_views if view.target == name)
+    shown = {one: np.isfinite(visible_pixels(estimate, one, places, 0.0)[:, 0]) for one in looking}
+    hidden = ~np.any([*shown.values()], axis=0)
+    at = {one: estimate.stations[one].cam_from_world.position for one in looking}
+    for first, second in combinations(shown, 2):
+        if {first, second} <= {*stated} or boards[first] & boards[second] - {None}:
+            continue
+        apart, either = at[first] - at[second], shown[first] | shown[second]
+        shares = np.array([np.sum(shown[first] & shown[second]), np.sum(either[::-1] & hidden)]) / max(
+            np.sum(either), 1
+        )
+        if np.hypot(*apart[:2]) < near * at[first][2] and shares[0] > same and shares[1] > unseen:
+            yield _TWICE.format(first, second, name)
+
+
+def _seen_from_behind(estimate: Estimate, observations: Observations, lost: Collection[str | None]) -> Iterator[str]:
     """Yield warnings about opaque flat targets that some views show from the other side than most, and about cameras
     that see every printed checkerboard from behind: the mirrored picture of a plane fits as well as the true one. There
     is no warning of the second kind where a camera sees a floor, which `require_possible` found to be seen from above:
     then the pictures are right, and the rows of the boards are counted upwards.
-
-    Args:
-        lost: placements whose poses are not known.
     """
     posed = {*estimate.placements} - {*lost}
     yield from _seen_from_both_sides(estimate, observations, posed)

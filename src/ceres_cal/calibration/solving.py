@@ -12,9 +12,9 @@ from ceres_cal.calibration.outcome import (
     aspects_alone,
     came_out,
     of_all,
+    other_ways_round,
     remarks_of,
     require_lens_told,
-    seen_from_behind,
     unknown_phi,
     unusual_pixels,
 )
@@ -273,7 +273,7 @@ def known_of(seen: TaskSolution) -> Calibration:
         alone = aspects_alone(seen.end, seen.problem, posterior)
         strange = (
             *unusual_pixels(seen.end, seen.problem, alone),
-            *seen_from_behind(seen.end.estimate, seen.problem.observations, [one.key.placement for one in lost]),
+            *other_ways_round(seen.end, seen.problem, [one.key.placement for one in lost]),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
         remarks = tuple(remarks_of(seen.end, seen.problem, posterior))
