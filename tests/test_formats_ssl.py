@@ -146,6 +146,9 @@ def test_what_loses_less_is_named(tmp_path: Path) -> None:
     worst = max(worst for _, worst in exported.losses[0].field_mm.values())
     (said,) = [text for text in exported.warnings if "one coefficient cannot describe this lens" in text]
     assert worst > 10.0 and f"{worst:.3g} mm)" in said and "--to opencv (0 mm at most)" in said
+    oblong = over_field(with_lens(SSL_LENS, aspect=1.01))
+    (said,) = export(oblong, "ssl-vision", tmp_path / "b.pb").warnings
+    assert "one focal length cannot describe fy / fx = 1.0100" in said and "--fix aspect=1" in said
 
 
 def test_a_negative_distortion_is_said_out_loud(tmp_path: Path) -> None:

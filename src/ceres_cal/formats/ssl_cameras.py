@@ -63,18 +63,25 @@ def to_entries(request: ExportRequest, camera_id: str, box_m: Box | None) -> tup
 
 
 def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]:
-    """Suggest formats that represent a camera better, if one coefficient causes a large error."""
+    """Suggest what represents a camera better, if one coefficient, or one focal length, causes a large error."""
     much_mm = 10.0  # largest error anywhere on the field: the width of a line
     worst = max((worst for _, worst in loss.field_mm.values()), default=0.0)
     if not worst > much_mm:
         return []
     other = nearest_foreign(camera, loss.station, opencv_models(camera), box_m)[1]
     left = max(worst for _, worst in other.field_mm.values())
+    cause, remedy = "one coefficient cannot describe this lens", "or more cameras, each seeing less of the field"
+    if _has_one_coefficient(camera):
+        cause = f"one focal length cannot describe fy / fx = {camera.aspect:.4f}"
+        remedy = "or calibrate with --fix aspect=1 if its pixels are square"
     return [
-        f"one coefficient cannot describe this lens (error up to {short(worst, 3)} mm): for less, use --to opencv "
-        f"({short(left)} mm at most) or --to table in your own software, or more cameras, each seeing less of the "
-        "field"
+        f"{cause} (error up to {short(worst, 3)} mm): for less, use --to opencv ({short(left)} mm at most) or --to "
+        f"table in your own software, {remedy}"
     ]
+
+
+def _has_one_coefficient(camera: Camera) -> bool:
+    return camera.lens.kind == "radial" and camera.lens.powers == (3,)
 
 
 def as_before(entry: Mapping[str, Any], before: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -102,7 +109,7 @@ def _nearest(camera: Camera, box_m: Box | None) -> Camera:
     """Return the camera with one focal length and one coefficient that locates most similarly on the field, from the
     same place.
     """
-    if camera.lens.kind == "radial" and camera.lens.powers == (3,) and (camera.aspect, camera.skew) == (1.0, 0.0):
+    if _has_one_coefficient(camera) and (camera.aspect, camera.skew) == (1.0, 0.0):
         return camera
     if box_m is None:
         raise InputError("no field to fit ssl-vision's camera over: calibrate with the field, or use a radial lens "
