@@ -99,7 +99,7 @@ def _read(request: ImportRequest) -> Any:
     if not model.num_images():
         raise InputError("the model has no images, so the poses of its cameras are unknown")
     cameras, warnings = {}, []
-    for image in model.images.values():
+    for _, image in sorted(model.images.items()):  # the library has them in an order of its own
         name = _name(image)
         if not image.has_pose:
             warnings.append(f"image {image.name!r} has no pose and was left out")

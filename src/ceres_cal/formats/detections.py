@@ -250,7 +250,7 @@ def _read_colmap(request: ImportRequest) -> Observations:
     names = {number: place for place, number in enumerate(model.points3D)}
     target = custom({str(n): tuple(float(v) for v in model.points3D[n].xyz) for n in names})  # type: ignore[misc]
     views, rows, cameras = [], [], {}
-    for image in model.images.values():
+    for _, image in sorted(model.images.items()):
         seen = [point for point in image.points2D if point.has_point3D()]
         if not seen:
             continue
