@@ -28,7 +28,6 @@ from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejection
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations, SightKey, View
-from ceres_cal.posterior.maps import visible_pixels
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
@@ -39,7 +38,6 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.noise import visible_from
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_possible
-from ceres_cal.scene.symmetry import TURNED, counterparts
 from ceres_cal.start.initialise import Start
 
 if TYPE_CHECKING:
@@ -192,9 +190,10 @@ def other_ways_round(end: RobustSolution, problem: Problem, lost: Collection[str
         lost: placements whose poses are not known.
     """
     yield from _seen_from_behind(end.estimate, problem.observations, lost)
-    stated = {
-        one.name for one in (*problem.observations.priors, *problem.options.priors) if one.quantity == "position_m"
-    }
+    if len(end.estimate.stations) < 2:
+        return
+    priors = (*problem.observations.priors, *problem.options.priors)
+    stated = {one.name for one in priors if one.quantity == "position_m"}
     for name in dict.fromkeys(view.target for view in problem.observations.shown_views if view.placement is None):
         yield from _seen_twice(end.estimate, problem.observations, name, stated)
 
@@ -203,6 +202,9 @@ def _seen_twice(estimate: Estimate, observations: Observations, name: str, state
     """Check a field that looks the same after half a turn: do two stations at one place show one part of it, and none
     the part opposite? Boards that both see, or positions that were stated, decide it.
     """
+    from ceres_cal.posterior.maps import visible_pixels
+    from ceres_cal.scene.symmetry import TURNED, counterparts
+
     near, steps = 0.2, 24  # distance over height; places along each side
     same, unseen = 0.3, 0.15  # shares of the part that is shown; with these, none of 960 rigs of 2 and 4 is named
     target, boards = observations.targets[name], dict[str, set[str | None]]()
@@ -220,10 +222,9 @@ def _seen_twice(estimate: Estimate, observations: Observations, name: str, state
         if {first, second} <= {*stated} or boards[first] & boards[second] - {None}:
             continue
         apart, either = at[first] - at[second], shown[first] | shown[second]
-        shares = np.array([np.sum(shown[first] & shown[second]), np.sum(either[::-1] & hidden)]) / max(
-            np.sum(either), 1
-        )
-        if np.hypot(*apart[:2]) < near * at[first][2] and shares[0] > same and shares[1] > unseen:
+        shares = np.array([np.sum(shown[first] & shown[second]), np.sum(either[::-1] & hidden)])
+        is_near = np.hypot(*apart[:2]) < near * at[first][2]
+        if is_near and np.all(shares > np.array([same, unseen]) * np.sum(either)):
             yield _TWICE.format(first, second, name)
 
 

@@ -31,7 +31,6 @@ _USUAL_TILT = 0.5
 _PRIOR_WEIGHT = 0.03
 # Tilt in degrees, and number of directions of the tilt.
 _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24), (63.0, 26), (71.0, 28))
-_ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off, in the first and the last round
 # Least share of the strokes in the direction that has fewer, as a floor needs both. Nothing changes from half to
 # double. And the same as a share of what the target has there: fields without touch lines have little.
@@ -103,7 +102,8 @@ def best_score(ends: Array, weights: Array, own_share: float) -> float:
 
 def _rotations() -> Array:
     """(B, 3, 3) a grid of all rotations relative to the floor, except for quarter turns about the vertical."""
-    rolls = np.array([rotation_exp([0.0, 0.0, roll]) for roll in np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))])
+    step_deg = 5.0
+    rolls = np.array([rotation_exp([0.0, 0.0, roll]) for roll in np.deg2rad(np.arange(-45.0, 45.0, step_deg))])
     ways = [(tilt, 2.0 * np.pi * number / count) for tilt, count in _RINGS_DEG for number in range(count)]
     leans = [rotation_exp(np.deg2rad(tilt) * np.array([np.cos(way), np.sin(way), 0.0])) for tilt, way in ways]
     return np.asarray((np.array(leans)[:, None] @ _DOWN @ rolls).reshape(-1, 3, 3), dtype=np.float32)
