@@ -93,6 +93,13 @@ def test_what_are_no_photographs(given: Any) -> None:
         image_files(given)
 
 
+def test_hidden_files_of_a_folder_are_no_photographs(tmp_path: Path) -> None:
+    """A Mac leaves "._0001.jpg" beside "0001.jpg" on other disks, which stopped the whole folder."""
+    for name in ("0001.jpg", "._0001.jpg"):
+        (tmp_path / name).touch()
+    assert image_files([tmp_path]) == [tmp_path / "0001.jpg"]
+
+
 def test_a_field_is_named_as_on_the_command_line() -> None:
     photograph = Path(__file__).resolve().parents[1] / "data" / "ssl_field" / "photographs" / "0001.jpg"
     found = ceres_cal.detect_field(photograph, "ssl-b", facing={"LeftGoalLine": "top"})

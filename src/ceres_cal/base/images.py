@@ -51,8 +51,8 @@ def _files(name: str) -> Iterable[Path]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """The images of a folder, or its videos where there are no images."""
-    files = sorted(file for file in folder.iterdir() if file.is_file())
+    """The images of a folder, or its videos where there are no images; hidden files, as Macs add, are no images."""
+    files = sorted(file for file in folder.iterdir() if file.is_file() and not file.name.startswith("."))
     images, videos = ([f for f in files if f.suffix.lower() in endings] for endings in (IMAGE_ENDINGS, VIDEO_ENDINGS))
     return images or videos
 
