@@ -28,6 +28,7 @@ from ceres_cal.detect.photographs.by_hand import Clicks
 from ceres_cal.detect.photographs.candidates import candidates, off_centre, prepare_search
 from ceres_cal.detect.photographs.follow import Tracker
 from ceres_cal.detect.photographs.grid import agreeing_with_facing, grid_of, nearest_to_before, side_of
+from ceres_cal.detect.photographs.judgement import objection
 from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import search
@@ -161,6 +162,19 @@ def test_views_of_any_kind(view: str) -> None:
     shot = auto_script.take_view(view, auto_script.VIEWS[view], 1)
     (found,) = auto_script.searched(iter([shot]))
     assert found.what == "right", found
+
+
+def test_a_camera_within_the_floor_shows_no_field(shot: script.Shot) -> None:
+    """Seen along the floor all lines are one, on which paint is found: a picture was "found" from 0.2 mm above it."""
+    problem = prepare_search(shot.grey, FIELD, NAMES, TOP)
+    found = search(shot.grey, FIELD, NAMES, TOP).followed
+    assert found is not None and not objection(problem, found)
+    pose = found.camera.cam_from_world
+    for height_m, is_above in ((0.05, False), (1.0, True)):
+        away = -pose.rotation @ (*found.camera.position[:2], height_m)
+        there = found.camera.at(replace(pose, translation=away))
+        against = objection(problem, replace(found, camera=there))
+        assert against.startswith("its lines were not found in any view from above") != is_above
 
 
 def test_without_a_word_on_which_way_round(shot: script.Shot) -> None:

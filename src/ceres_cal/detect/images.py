@@ -52,8 +52,8 @@ def read_light(path: str | Path) -> Array32:
         InputError: see `read_grey`.
     """
     picture, depths = read_colour(path), (8, 10, 12, 16)
-    white = next(level for level in (2**bits - 1 for bits in depths) if np.max(picture) <= level)
-    return light(picture) * np.float32(255.0 / white)
+    levels = next(2**bits for bits in depths if np.max(picture) < 2**bits)  # floats end at 255, but for rounding
+    return light(picture) * np.float32(255.0 / (levels - 1))
 
 
 def light(image: Image) -> Array32:

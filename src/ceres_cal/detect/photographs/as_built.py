@@ -33,7 +33,7 @@ _LOG_ODDS = np.log(0.1 / 0.9)  # prior log odds that a curve is misplaced, or th
 _BEAM, _MOST, _IN_VAIN = 24, 9, 3
 # Least change of a dimension that makes another field: as a share of it, and in units of the usual offset of a
 # misplaced curve. A tape measure, an unusual lens and a floor that is not flat cause smaller changes, and the standard
-# deviation contains neither of them: through a decentred lens, 9 m seemed 9.073 with one of 2 mm.
+# deviation contains none of these: through a decentred lens, 9 m seemed 9.073 with one of 2 mm.
 _OTHER_FIELD, _LONGER = 0.02, 4.0
 # Least change of a dimension in its standard deviations, which assume that lines are taped independently of each other.
 _SURELY = 10.0
@@ -74,12 +74,12 @@ class FieldAsBuilt(Frozen):
         """Whether this is another field: a dimension differs by too much for a tape measure, lines are misplaced
         everywhere, or they are bent as by no lens.
         """
-        changed = any(map(self._is_other, self.dimensions))
+        changed = any(map(self._is_unusual, self.dimensions))
         far = float(np.linalg.norm(list(self.aside_m.values())))
         elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
         return changed or elsewhere or self._is_bent
 
-    def _is_other(self, dimension: str) -> bool:
+    def _is_unusual(self, dimension: str) -> bool:
         """Whether a dimension differs by more than a tape measure, an unusual lens and a floor that is not flat do."""
         drawn_m = self.drawn[dimension]
         usual_m = max(_SURELY * self.sd_m[dimension], min(_OTHER_FIELD * drawn_m, _LONGER * self.usual_m))
@@ -95,7 +95,7 @@ class FieldAsBuilt(Frozen):
         dimensions = [
             f"{_spoken(name)} is {_change(length / self.drawn[name])} than the target says, "
             f"{length:.3f} ± {self.sd_m[name]:.3f} m instead of {self.drawn[name]:g}: other dimensions?"
-            if self._is_other(name)
+            if self._is_unusual(name)
             else f"{_spoken(name)} seems {_change(length / self.drawn[name])} than the target says "
             f"({self.drawn[name]:g} m): it differs, or the lens is unusual, or the floor is not flat"
             for name, length in self.dimensions.items()

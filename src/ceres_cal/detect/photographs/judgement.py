@@ -69,10 +69,8 @@ def objection(search: FieldSearch, followed: FieldLines) -> str:
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
         return f"only {', '.join(names)} would be in the picture, too few lines to find a field: start from corners"
-    upright, extent_m = (
-        -followed.camera.cam_from_world.rotation[2, 2],
-        float(np.max(np.ptp(followed.target.box, axis=0))),
-    )
+    upright = -followed.camera.cam_from_world.rotation[2, 2]
+    extent_m = float(np.max(np.ptp(followed.target.box, axis=0)))
     is_above = upright > _LEAST_UPRIGHT and followed.camera.position[2] > lowest * extent_m
     if not (is_above and is_lens(followed.camera)):
         return "its lines were not found in any view from above: start from corners"
